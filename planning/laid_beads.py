@@ -19,7 +19,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array, Index
 from estimation.surface_map import SurfaceHeights
 from planning.material import AS_PLANNED, FlowShares, bead_areas, is_metered
-from planning.path import MIN_SPACING, Path, way_lengths
+from planning.path import MIN_SPACING, Path, ways_along
 
 STATION_LENGTH = 1.25  # mm of bead judged as one: a quarter of the shortest clog that must be found, to see its ends
 BESIDE = 0.4  # mm beside a planned bead that count to it: how far a nozzle is off, and gel creeps
@@ -64,7 +64,7 @@ def pieces_between(
         raise InputError(where, "look", "a path without amounts", "columns width_mm and height_mm, or volume_mm3")
     ways = np.arange(max(int(np.floor(first)), 0) + 1, min(int(np.ceil(last)), len(path) - 1) + 1)
     poses = path.surface_from_nozzle
-    knots = _knots(path)
+    knots = ways_along(path.surface_from_nozzle)
     begins = path.extrude & ~np.concatenate([[False], path.extrude[:-1]])
     bead = np.cumsum(begins) - 1
     begun, done = np.clip(first - ways + 1, 0.0, 1.0), np.clip(last - ways + 1, 0.0, 1.0)  # shares of each way
@@ -347,7 +347,7 @@ def adapted_flow(path: Path, looks: Sequence[Look], told: FlowShares = AS_PLANNE
     Each piece of the next layer gets what the nearest pieces lack, or less where they have too much: MIN_FLOW to
     MAX_FLOW of what was planned.
     """
-    place, knots = looks[-1].last, _knots(path)
+    place, knots = looks[-1].last, ways_along(path.surface_from_nozzle)
     later = np.arange(min(int(np.ceil(place)), len(path) - 1) + 1, len(path))
     later = later[path.extrude[later]]
     if not len(later) or path.layer[later[0]] == looks[-1].laid.stations.layer[-1:]:
@@ -382,11 +382,6 @@ def _lacks(path: Path, knots: Array, look: Look, told: FlowShares) -> tuple[Arra
     with np.errstate(invalid="ignore"):
         lack = np.where(np.abs(lack) < np.maximum(MIN_LACK, SURE * laid.sigma / laid.planned * due), 0.0, lack)
     return _at(path, knots, (stations.begin + stations.end) / 2), lack * stations.crest, sure
-
-
-def _knots(path: Path) -> Array:
-    """Places (N,) mm of the checkpoints along the path."""
-    return np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
 
 
 def _at(path: Path, knots: Array, place: Array) -> Array:

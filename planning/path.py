@@ -120,6 +120,11 @@ def way_lengths(surface_from_nozzle: Array) -> Array:
     return lengths_from(*moves_and_turns(surface_from_nozzle))
 
 
+def ways_along(surface_from_nozzle: Array) -> Array:
+    """Way (N,), mm, from the first of poses (N, 4, 4) to each, by `way_lengths`."""
+    return np.concatenate([[0.0], np.cumsum(way_lengths(surface_from_nozzle))])
+
+
 def moves_and_turns(surface_from_nozzle: Array) -> tuple[Array, Array]:
     """Moves (N-1, 3), mm, and turns (N-1, 3), body vectors in rad, between poses (N, 4, 4)."""
     rotations = surface_from_nozzle[:, :3, :3]

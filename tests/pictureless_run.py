@@ -82,17 +82,20 @@ def track_nothing(
         clock.wait_until(due)
         stamp, sets = due - AGE, round((due - begin) * RATE)
         pose = pose_at(lambda t: breathing(t, height=height, tilt=TILT), stamp)
-        channels.poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
-        seen = {"used": (50, 50), "looks": channels.looks.value, "surface": ground, "since": begin}
+        channels.shared.poses.put(PoseHandover(pose, due - AGE / 2, clock.now()))
+        order = channels.shared.search.get()
+        looks = 0 if order is None else order.looks
+        seen = {"used": (50, 50), "looks": looks, "surface": ground, "since": begin}
         seen["unrecorded"] = outbox.dropped
-        channels.reports.put(TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, **seen))
+        report = TrackingReport(clock.now(), names, (0, 1), pose, *known, sets, 0, 1 / RATE, **seen)
+        channels.shared.tracking.put(report)
         outbox.put(SetEntry({0: stamp, 1: stamp}, {0: ("png", picture), 1: ("png", picture)}))
         outbox.put(PoseEntry(pose, no_observations(stamp)))
         for k in range(BURST_SETS if burst and sets == BURST_AFTER else 0):
             outbox.put(SetEntry({0: stamp + 1e-4 * (k + 1)}, {0: ("png", picture + bytes(2**20))}))
-        moved = channels.motion.get()
+        moved = channels.shared.motion.get()
         if moved is not None and moved.progress is not None and moved.progress.phase.value == last:
-            channels.reports.put(replace(channels.reports.get(), ended="session is over"))
+            channels.shared.tracking.put(replace(report, ended="session is over"))
             break
     outbox.close()
 

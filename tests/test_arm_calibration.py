@@ -316,8 +316,8 @@ def touched_file(tmp_path: Path, axes: Array, points: Array, pixels: bool) -> tu
 def test_a_file_of_touched_points_makes_an_arm_file(tmp_path: Path, pixels: bool) -> None:
     true, axes, points = touched(6, True, 0.0)
     file, rig = touched_file(tmp_path, axes, points, pixels)
-    outcome = calibrate_touched(file, rig, TOLD, tmp_path / "arm.toml", keep_tool=False)
-    assert outcome.verdict.passed
+    verdict, _ = calibrate_touched(file, rig, TOLD, tmp_path / "arm.toml", keep_tool=False)
+    assert verdict.passed
     arm = read_arm(tmp_path / "arm.toml").arm
     assert np.allclose(arm.arm_from_base @ true.base_from_arm, np.eye(4), atol=1e-2)
     assert arm.tool_offset == pytest.approx(true.tool, abs=1e-2)
@@ -327,8 +327,8 @@ def test_a_point_that_was_another_one_is_named(tmp_path: Path) -> None:
     _, axes, points = touched(8, False, 0.05)
     points[4] += [0.0, 4.0, 0.0]
     file = touched_file(tmp_path, axes, points, False)
-    outcome = calibrate_touched(*file, TOLD, tmp_path / "arm.toml", keep_tool=True)
-    assert not outcome.verdict.passed and "touch point 5 again" in outcome.verdict.hints[0]
+    verdict, _ = calibrate_touched(*file, TOLD, tmp_path / "arm.toml", keep_tool=True)
+    assert not verdict.passed and "touch point 5 again" in verdict.hints[0]
 
 
 @pytest.mark.parametrize(

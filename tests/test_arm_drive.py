@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation import se3
+from estimation.calibration.arm_fit import ArmUnknowns
 from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.device import ArmState
@@ -29,7 +30,7 @@ from hardware.calibration.arm_record import (
     plan_moves,
     read_commanded,
 )
-from hardware.calibration.arm_run import ArmCalibrationOptions, check_out, check_record, run_folder
+from hardware.calibration.arm_run import check_out, check_record, run_folder
 from hardware.cli.main import main
 from hardware.files.arm_file import read_arm
 from hardware.process.clock import SimClock
@@ -133,7 +134,7 @@ def test_where_files_go_is_checked_first(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="new or empty folder"):
         check_record(tmp_path / "full")
     with pytest.raises(InputError, match=COMMANDED_FILE):
-        run_folder(tmp_path / "full", tmp_path / "arm.toml", ArmCalibrationOptions(), no_progress)
+        run_folder(tmp_path / "full", tmp_path / "arm.toml", 0.1, ArmUnknowns(), no_progress)
 
 
 @pytest.mark.parametrize(("name", "value"), [("places", 2), ("reach", -1.0), ("speed", 500.0), ("dwell", 0.0)])

@@ -15,7 +15,15 @@ import pytest
 from estimation import se3
 from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_from_terms, focal_terms, homography, poses
 from estimation.rig import pixels_from_points
-from hardware.calibration.corners import COVERAGE_GRID, MIN_COMMON_SETS, CoverageGuide, coverage_of, missing_coverage
+from hardware.calibration.corners import (
+    COVERAGE_GRID,
+    MIN_COMMON_SETS,
+    CoverageGuide,
+    board_orientations,
+    coverage_from_parts,
+    missing_coverage,
+    parts_of,
+)
 from hardware.calibration.live import WavingRecorder, devices_named, watch
 from hardware.calibration.run import CalibrationOptions, finish
 from hardware.cameras.feed import CameraPhase, CameraState, LiveHealth
@@ -219,9 +227,8 @@ def test_the_sum_is_what_all_views_tell_and_old_ones_are_seldom_seen_again(monke
         guide.missing()
     seen = [np.isfinite(pixels[:, 0]) for pixels in views]
     planes = np.stack([homography(BOARD.corners[s, :2], p[s] - middle) for s, p in zip(seen, views, strict=True)])
-    whole = coverage_of(
-        np.stack(views), SIZE, poses(planes, np.full(len(planes), focal_from_terms(focal_terms(planes))))
-    )
+    found = poses(planes, np.full(len(planes), focal_from_terms(focal_terms(planes))))
+    whole = coverage_from_parts(parts_of(np.stack(views), SIZE), board_orientations(found))
     held = guide.coverage(0)
     assert np.array_equal(held.parts, whole.parts)
     assert held.tilts == pytest.approx(whole.tilts, abs=0.05) and held.depth == pytest.approx(whole.depth, rel=0.03)
@@ -229,6 +236,6 @@ def test_the_sum_is_what_all_views_tell_and_old_ones_are_seldom_seen_again(monke
 
 
 def test_nothing_seen_lacks_everything() -> None:
-    held = coverage_of(np.zeros((0, 12, 2)), SIZE, np.zeros((0, 4, 4)))
+    held = coverage_from_parts(parts_of(np.zeros((0, 12, 2)), SIZE), board_orientations(np.zeros((0, 4, 4))))
     assert held.parts.shape == COVERAGE_GRID[::-1]
     assert [share for share, _ in missing_coverage("a", held)] == [1.0, 1.0, 1.0]

@@ -51,7 +51,7 @@ def test_a_region_reaches_the_run_from_a_window_that_shows_what_it_asks_now_and_
             assert page.link.regions.get() is None
             assert await answer(socket, BOTH) == ""
             drawn = page.link.regions.get()
-            assert drawn is not None and dict(drawn.polygons) == {k: tuple(map(tuple, v)) for k, v in BOTH.items()}
+            assert drawn is not None and dict(drawn) == {k: tuple(map(tuple, v)) for k, v in BOTH.items()}
             page.put(asked_view(2, draws=False))
             while (await socket.next())["view"]["turn"] < 2:
                 pass
@@ -208,9 +208,9 @@ def test_corners_that_are_clicked_are_the_regions_corners(browser: Browser) -> N
         page.until('document.getElementById("toast").textContent.includes("was taken")')
         drawn = made.link.regions.get()
         assert drawn is not None
-        for name, corners in drawn.polygons:
+        for name, corners in drawn:
             assert np.abs(np.array(corners) - wanted[name]).max() < 1.0
-        assert {name for name, _ in drawn.polygons} == set(wanted)
+        assert {name for name, _ in drawn} == set(wanted)
         made.put(asked_view(2, draws=False))
         page.until('document.getElementById("draw").hidden')
         page.close()

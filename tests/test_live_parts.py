@@ -37,10 +37,10 @@ from hardware.live.ipc import schedule, turning_sets
 from hardware.live.prepared import (
     RunFiles,
     SurfacePlacement,
+    placement_text,
     prepare,
     prepare_resumed,
     read_placement,
-    write_placement,
 )
 from hardware.live.recorder_process import ENTRY_HEAD, RecorderReceiver, RecorderSender, packed, record, unpacked
 from hardware.live.records import (
@@ -447,16 +447,18 @@ def test_a_place_is_kept_without_a_new_name_in_the_table_of_names(
 def test_where_the_path_lies_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
     pose = se3.make(se3.exp_rotation([0.1, 0.2, 0.3]), np.array([1 / 3, 2 / 3, 1e-9]))
-    write_placement(tmp_path / "x.toml", SurfacePlacement(tmp_path / "run.mcap", 1 / 7, pose, se3.inverse(pose)))
+    (tmp_path / "x.toml").write_text(
+        placement_text(SurfacePlacement(tmp_path / "run.mcap", 1 / 7, pose, se3.inverse(pose)))
+    )
     found = read_placement(tmp_path / "x.toml")
     assert (found.surface_from_path == pose).all() and (found.arm_from_base == se3.inverse(pose)).all()
     assert found.until == 1 / 7 and found.since == -np.inf and not found.certain and not found.verdict
     said = SurfacePlacement(tmp_path / "run.mcap", 0.5, pose, pose, 0.25, True, 'by "hand" \\ and a scan')
-    write_placement(tmp_path / "z.toml", said)
+    (tmp_path / "z.toml").write_text(placement_text(said))
     again = read_placement(tmp_path / "z.toml")
     assert (again.since, again.certain, again.verdict) == (said.since, True, said.verdict)
     for name in ("gone.mcap", 800 * "x"):
-        write_placement(tmp_path / "y.toml", SurfacePlacement(tmp_path / name, 0.0, pose, pose))
+        (tmp_path / "y.toml").write_text(placement_text(SurfacePlacement(tmp_path / name, 0.0, pose, pose)))
         with pytest.raises(InputError, match="map"):
             read_placement(tmp_path / "y.toml")
     assert RunFiles(tmp_path / "run.mcap").next().record == tmp_path / "run-2.mcap"
@@ -516,7 +518,7 @@ def test_a_run_that_resumes_one_that_resumed_knows_what_the_first_one_found(tmp_
     first = prepare(LiveSettings(rig=rig, path=path, arm="virtual", record=record), "here", False)
     first.files.session.write_text(settings_text(first.settings))
     place = se3.make(np.eye(3), np.array([1.0, 2, 3]))
-    write_placement(first.files.surface, SurfacePlacement(rig, 5.0, place, se3.inverse(place)))
+    first.files.surface.write_text(placement_text(SurfacePlacement(rig, 5.0, place, se3.inverse(place))))
     write_progress_durably(first.files.progress, fingerprint(first.task.path), 2.5)
     for _ in range(3):
         record.touch()
@@ -709,7 +711,7 @@ def test_what_a_recorder_has_not_taken_when_its_sender_is_closed_is_counted() ->
         sender.put(EventEntry(0.0, "x" * size, 2, "y"))
     sender.close(0.2)
     assert sender.dropped == 4 and len(list(receiver.take())) == 2
-    receiver.close()
+    ours.close()
 
 
 def test_a_sender_whose_recorder_has_ended_is_no_failure_of_its_own() -> None:

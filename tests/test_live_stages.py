@@ -23,7 +23,6 @@ from hardware.live.outcome import RunOutcome, RunStatistics
 from hardware.live.prepared import Prepared, RunFiles
 from hardware.live.records import (
     TRACK_PLACES,
-    HoldTotal,
     LiveMotionReport,
     NozzleTrack,
     RecorderReport,
@@ -41,6 +40,7 @@ from hardware.operator.view import (
     MAX_MOVE_MM,
     STAGE_OFFERS,
     CheckVerdict,
+    HoldRow,
     MoveRequest,
     RequestAnswer,
     RunStage,
@@ -808,7 +808,8 @@ def test_what_a_run_came_to_counts_what_runs_before_it_printed() -> None:
 def test_the_report_adds_up_and_shows_what_was_printed(tmp_path: Path) -> None:
     run = Staged(start=2.5)
     statistics = RunStatistics(stages={"approach": 10.0, "print": 50.0, "homing": 9.0}, extruding=40.0, printing=50.0)
-    statistics.holds = {"pose is … s old": HoldTotal(3, 12.5), "paused by the operator": HoldTotal(1, 2.5)}
+    rows = HoldRow("pose is … s old", 3, 12.5), HoldRow("paused by the operator", 1, 2.5)
+    statistics.holds = {row.reason: row for row in rows}
     for k in range(100):
         statistics.errors.add(0.2 + 0.001 * k)
         statistics.add_true_error(0.1 + 0.001 * k, 0.1795)

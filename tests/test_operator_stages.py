@@ -428,7 +428,7 @@ def test_pictures_are_as_fine_as_the_camera_while_the_path_is_confirmed(run: Run
     page = run.open()
     shots = [CameraShot("camera0", np.random.default_rng(1).integers(0, 255, (720, 1280, 3)).astype(np.uint8),
                         (np.array([[200.0, 100], [1000, 100], [1000, 600], [200, 600]] * 3),))]  # fmt: skip
-    thumbnailer = Thumbnailer(link.pictures, link.requests)
+    thumbnailer = Thumbnailer(link.pictures, link.status)
     widths = {}
     for stage in (RunStage.PRINT, RunStage.CONFIRM):
         run.show(stage=stage)

@@ -29,7 +29,7 @@ from hardware.files.region_table import (
 )
 from hardware.live.settings import LiveSettings, check_settings, read_settings, settings_text
 from hardware.offline.track import DRAW_TEXT, region_search, tracker
-from hardware.operator.shared_state import DrawnRegion
+from hardware.operator.shared_state import Polygons
 from hardware.process.system import SharedLatest
 from perception.frames import FrameSet, Roi, region_polygons, region_since
 from perception.tracking.step import TrackingStep
@@ -240,17 +240,17 @@ def test_a_frame_of_another_colour_is_waited_for() -> None:
 
 
 def test_a_drawn_region_is_waited_for_and_taken_once_it_is_there() -> None:
-    line = SharedLatest[DrawnRegion]()
+    line = SharedLatest[Polygons]()
     search = region_search(rig(), RegionSettings(RegionBy.POLYGON), line)
     assert search is not None
     find, frames = search(None), sets()[3]  # type: ignore[arg-type]  # nothing is looked for in a thread
     assert find(frames) == DRAW_TEXT
-    line.put(DrawnRegion((("camera0", drawn(0)), ("camera2", drawn(2)))))
+    line.put((("camera0", drawn(0)), ("camera2", drawn(2))))
     rois = find(frames)
     assert [roi.camera for roi in rois if isinstance(roi, Roi)] == [0, 2]
     assert all(roi.stamp == frames.stamp for roi in rois if isinstance(roi, Roi))
     assert np.array_equal(list(rois)[1].polygon, drawn(2))  # type: ignore[union-attr]
-    line.put(DrawnRegion((("camera9", drawn(0)), ("camera2", drawn(2)))))
+    line.put((("camera9", drawn(0)), ("camera2", drawn(2))))
     with pytest.raises(InputError, match="camera9"):
         find(frames)
 

@@ -51,7 +51,7 @@ def rigs(draw: st.DrawFn) -> Rig:
 def test_what_is_written_comes_back(name: str, rig: Rig) -> None:
     kind = FORMATS[name]
     with TemporaryDirectory() as folder:
-        out = Path(folder) / ("rig" if kind.folder else "rig.toml" if name == "anipose" else "rig.yaml")
+        out = Path(folder) / {"anipose": "rig.toml", "kalibr": "rig.yaml"}.get(name, "rig")
         kind.write(out, rig)
         back = kind.read(out)
     change = rig.cameras[0].base_from_camera if name == "kalibr" else np.eye(4)  # its base is its first camera

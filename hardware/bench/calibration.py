@@ -31,7 +31,7 @@ from hardware.bench.figures import CONSISTENT_NEES, Figure, at_most, relative_ne
 from hardware.calibration.arm_record import MoveOptions, plan_moves
 from hardware.calibration.arm_run import record_in_virtual_time
 from hardware.calibration.arm_solve import kinematics_of, solve_folder
-from hardware.calibration.report import held_out_residual, median_residual
+from hardware.calibration.report import median_residual
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, no_progress
 from hardware.simulator.scene.render import BoardView
@@ -136,7 +136,7 @@ def _rendered_values(rig: Rig, instants: int) -> list[float]:
         rms(_triangulation_errors(calibration.rig, rig, points)),
         calibration.predicted_error(points).typical,
         median_residual(calibration),
-        held_out_residual(calibration),
+        median_residual(calibration, held_out=True),
         _camera_nees(calibration, error),
     ]
 

@@ -131,17 +131,17 @@ def run_part(seconds: float, seed: int, busy: int, part: str) -> LivePart:
         try:
             run.sender.put(prepared.rig)
             run.order(BeginPrint(prepared.task.path, prepared.task.profile, 0.0, {}, ""))
-            _wait(lambda: run.motion.get() is not None)
+            _wait(lambda: run.shared.motion.get() is not None)
             start = device = clock.now()
             while (now := clock.now()) < start + seconds:
-                operator.act(run.motion.get(), now)
+                operator.act(run.shared.motion.get(), now)
                 if part == HALTED_PART and now > device + DEVICE_SPAN:
                     run.processes.end("arm", 0.0)
                     operator.measured.arms.append(_arm_report(prepared))
                     run.arm_lifeline = start_arm(run.processes, prepared, Path(run.url))
                     device = clock.now()
                 clock.wait_until(now + 1 / ORDER_RATE)
-            operator.end(run.motion.get())
+            operator.end(run.shared.motion.get())
             operator.measured.arms.append(_arm_report(prepared))
         finally:
             run.processes.kill_all()
@@ -163,8 +163,8 @@ def tell_poses(prepared: Prepared, channels: TrackingChannels) -> None:
     clock = WallClock()
     while not channels.lifeline.poll():
         now = clock.now()
-        channels.poses.put(PoseHandover(_pose(now), now, now))
-        channels.bell.ring()
+        channels.shared.poses.put(PoseHandover(_pose(now), now, now))
+        channels.shared.bell.ring()
         clock.wait_until(now + 1 / POSE_RATE)
 
 

@@ -14,10 +14,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats.qmc import Halton
 
 from estimation.calibration.arm_model import SetPoint
 from estimation.errors import InputError
@@ -27,7 +29,7 @@ from estimation.se3 import Array
 from hardware.arm.device import ArmState
 from hardware.arm.driver import ArmDriver
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, LinkSettings
+from hardware.arm.profile import DISPLAY_UNITS, ArmProfile, LinkSettings
 from hardware.arm.queue import QueuedCommand
 from hardware.cameras.live import LiveCameras
 from hardware.files.arm_file import write_arm
@@ -42,9 +44,7 @@ ARM_FILE = "arm.toml"  # of a recorded calibration: the arm before it
 COMMANDED_FILE = "commanded.csv"
 COMMANDED_HEADER = "stamp_s,x_mm,y_mm,z_mm,a_deg,b_deg,c_deg"
 STAMP_RESOLUTION = 2e-6  # s: nearer knots are equal in six digits
-_UNITS = np.array([1, 1, 1, *np.rad2deg([1.0, 1, 1])])
 PEAK_SPEED_RATIO = 1.875  # peak to mean speed of a minimum-jerk move (10 s^3 - 15 s^4 + 6 s^5)
-HALTON_BASES = (2, 3, 5, 7, 11, 13)  # even for any number of places
 UPRIGHT_EVERY = 3  # one place in so many has no turn
 SWING_SINES = np.array([6.0, 5.0, 4.0]), np.array([2.2, 1.7, 1.3])  # mm and Hz of X Y Z
 SWING_LOAD = 0.6  # of the speed and acceleration limits
@@ -91,21 +91,12 @@ def plan_moves(start: Array, limits: MotionLimits, tick: float, options: MoveOpt
 
 def places(start: Array, limits: MotionLimits, options: MoveOptions) -> Array:
     """Places (P, 6), mm and rad, spread evenly about the start, within the arm's bounds."""
-    spread = np.array([[_halton(i + 1, base) for base in HALTON_BASES] for i in range(options.places)])
+    spread = Halton(len(start), scramble=False).random(options.places + 1)[1:]  # even for any number; the first is 0
     half = np.array([options.reach, options.reach, (options.up + options.down) / 2, *[options.turn] * 3])
     middle = start + np.array([0, 0, (options.up - options.down) / 2, 0, 0, 0])
     out = middle + (2 * spread - 1) * half
     out[::UPRIGHT_EVERY, 3:] = start[3:]
     return np.asarray(np.clip(out, limits.low + AXIS_MARGIN, limits.high - AXIS_MARGIN))
-
-
-def _halton(index: int, base: int) -> float:
-    out, share = 0.0, 1.0
-    while index:
-        share /= base
-        index, digit = divmod(index, base)
-        out += share * digit
-    return out
 
 
 def straight_move(start: Array, goal: Array, tick: float, options: MoveOptions) -> Iterator[Array]:
@@ -171,7 +162,8 @@ class CommandedFile:
     def _add(self, way: QueuedCommand) -> None:
         for instant, axes in ((way.start, way.source), (way.end, way.target)):
             if instant >= self._last_knot + STAMP_RESOLUTION:
-                self._file.write(f"{instant:.6f}," + ",".join(f"{v:.6f}" for v in np.array(axes) * _UNITS) + "\n")
+                row = instant, *(np.array(axes) * DISPLAY_UNITS)
+                self._file.write(",".join(f"{value:.6f}" for value in row) + "\n")
                 self._last_knot = instant
 
     def __enter__(self) -> CommandedFile:
@@ -196,7 +188,7 @@ def read_commanded(path: Path) -> SetPoint:
     table = np.array(rows)
     if (back := np.flatnonzero(np.diff(table[:, 0]) <= 0)).size:
         raise InputError(path, f"line {back[0] + 3}: stamp_s", table[back[0] + 1, 0], "stamps that rise")
-    return SetPoint(np.ascontiguousarray(table[:, 0]), table[:, 1:] / _UNITS)
+    return SetPoint(np.ascontiguousarray(table[:, 0]), table[:, 1:] / DISPLAY_UNITS)
 
 
 def _row(path: Path, number: int, line: str) -> Array:
@@ -286,12 +278,12 @@ class PictureWriter(threading.Thread):
     the thread that moves the arm.
     """
 
-    def __init__(self, live: LiveCameras, rig: Rig, clock: Clock, folder: Path) -> None:
+    def __init__(self, live: LiveCameras, rig: Rig, clock: Clock, folder: Path, keep: bool) -> None:
         super().__init__(name="pictures", daemon=True)
         self._live, self._rig, self._clock, self._folder = live, rig, clock, folder
         self._ended = threading.Event()
         self._failed: Exception | None = None
-        self.count, self.keep = 0, True
+        self.count, self.keep = 0, keep
 
     def run(self) -> None:
         """Until `end`, or until something fails."""
@@ -352,31 +344,46 @@ def record_live(
 ) -> None:
     """Move an arm before live cameras and record both in a session folder; Ctrl-C stops the arm, keeping the record."""
     write_arm(folder / ARM_FILE, profile, "the arm as it was taken to be while it was calibrated")
-    with live:
-        arm = Arm(driver, profile, clock.now(), link)
-        writer = PictureWriter(live, rig, clock, folder)
-        writer.start()
+    with arm_before_cameras(live, rig, driver, profile, clock, folder, link) as (arm, writer):
 
         def progress(done: int, total: int) -> None:
             writer.check()
             report(done, total)
 
-        try:
-            await_pictures(writer, arm, clock)
-            move_arm(arm, clock, folder, stands, options, progress)
-        finally:
-            writer.end()
-            arm.close()
+        move_arm(arm, clock, folder, stands, options, progress)
+
+
+@contextmanager
+def arm_before_cameras(
+    live: LiveCameras,
+    rig: Rig,
+    driver: ArmDriver,
+    profile: ArmProfile,
+    clock: Clock,
+    folder: Path,
+    link: LinkSettings,
+    keep: bool = True,
+) -> Iterator[tuple[Arm, PictureWriter]]:
+    """An arm to be moved in the block, once live cameras give pictures, and the writer of these into a session folder.
+
+    keep: whether pictures are written from the start on. The cameras and the driver are let go at the end. InputError
+    where no pictures come.
+    """
+    with ExitStack() as stack:
+        stack.callback(driver.release)
+        stack.enter_context(live)
+        arm = Arm(driver, profile, clock.now(), link)
+        stack.callback(arm.close)
+        writer = PictureWriter(live, rig, clock, folder, keep)
+        writer.start()
+        stack.callback(writer.end)
+        end = clock.now() + FIRST_PICTURES_TIMEOUT
+        while writer.count < START_FRAME_SETS:
+            writer.check()
+            if clock.now() > end:
+                allowed = "cameras that deliver: stillbed cameras RIG.toml shows what they do"
+                raise InputError("cameras", "frame sets", writer.count, allowed)
+            arm.poll(clock.now())
+            clock.wait_until(clock.now() + 0.01)
+        yield arm, writer
     writer.check()
-
-
-def await_pictures(writer: PictureWriter, arm: Arm, clock: Clock) -> None:
-    """Wait for the first frame sets; InputError where they do not come."""
-    end = clock.now() + FIRST_PICTURES_TIMEOUT
-    while writer.count < START_FRAME_SETS:
-        writer.check()
-        if clock.now() > end:
-            allowed = "cameras that deliver: stillbed cameras RIG.toml shows what they do"
-            raise InputError("cameras", "frame sets", writer.count, allowed)
-        arm.poll(clock.now())
-        clock.wait_until(clock.now() + 0.01)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,22 @@ from estimation import se3
 from estimation.calibration.arm_model import predict
 from estimation.se3 import Array
 from hardware.calibration.arm_solve import ArmCalibration, kinematics_of
-from hardware.calibration.report import CalibrationVerdict, bullets, figure, figure_row, picture_frame
+from hardware.calibration.report import CalibrationVerdict, bullets, picture_frame
 from hardware.files.images import encode
-from hardware.report.page import chart, document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.page import (
+    captioned,
+    chart,
+    data_url,
+    document,
+    figure_row,
+    figures_table,
+    legend,
+    line_key,
+    row_of_tiles,
+    section,
+    tile,
+)
 
-MAX_TIP_ERROR = 0.1  # mm, of the tip in the working volume: a fourth of a bead
 MAX_HELD_OUT_ERROR = 0.3  # mm, median of held-out pictures: outliers and a bent arm are beyond it
 MAX_LAG_SIGMA = 0.005  # s, one sigma of the arm's lag: at 20 mm/s a tenth of a millimetre
 MIN_TIP_SHARE = 0.3  # of a camera's pictures in which the tip is found
@@ -174,14 +184,14 @@ def _crops(result: ArmCalibration) -> str:
     for camera, (images, pixels) in zip(result.rig.cameras, result.tips.crops, strict=True):
         for image, pixel in zip(images, pixels, strict=True):
             h, w = image.shape[:2]
-            data = base64.b64encode(encode(np.ascontiguousarray(image), CROP_QUALITY)[1]).decode()
+            data = data_url(encode(np.ascontiguousarray(image), CROP_QUALITY)[1])
             x, y = pixel + 0.5
             cross = f'<path class="truth" stroke-width="0.4" d="M{x - 4:.2f} {y:.2f}h8M{x:.2f} {y - 4:.2f}v8"/>'
             place = f'width="{w}" height="{h}" style="image-rendering:pixelated"'
-            picture = f'<image href="data:image/jpeg;base64,{data}" {place}/>'
+            picture = f'<image href="{data}" {place}/>'
             width = f'style="width:{CROP_SCALE * w}px"'
             svg = f'<svg class="plot" viewBox="0 0 {w} {h}" role="img" aria-label="tip" {width}>{picture}{cross}</svg>'
-            figures.append(figure(svg, camera.name))
+            figures.append(captioned(svg, camera.name))
     return figure_row(figures)
 
 
@@ -197,7 +207,7 @@ def _residuals(result: ArmCalibration) -> str:
         )
         median = float(np.median(np.linalg.norm(result.fit.residuals[rows], axis=1))) if rows.any() else float("nan")
         caption = f"{camera.name}: {int(rows.sum())} tips, median {median:.2f} px"
-        figures.append(figure(picture_frame(camera.size, lines, "residuals"), caption))
+        figures.append(captioned(picture_frame(camera.size, lines, "residuals"), caption))
     return figure_row(figures)
 
 

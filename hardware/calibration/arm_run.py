@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +27,10 @@ from estimation.mapping.triangulation import triangulate
 from estimation.rig import Rig
 from estimation.se3 import Array
 from hardware.arm.link import Arm
-from hardware.arm.profile import ArmProfile, open_arm
+from hardware.arm.profile import AXIS_UNITS, ArmProfile, open_arm
 from hardware.arm.s6h4d import S6H4D
 from hardware.calibration.arm_record import ARM_FILE, COMMANDED_FILE, MoveOptions, move_arm, read_commanded
-from hardware.calibration.arm_report import MAX_TIP_ERROR, ArmTruth, arm_page, arm_text, judge_arm
+from hardware.calibration.arm_report import ArmTruth, arm_page, arm_text, judge_arm
 from hardware.calibration.arm_solve import calibrated_profile, kinematics_of, numbers_text, solve_folder, tip_error
 from hardware.calibration.report import CalibrationVerdict
 from hardware.files.arm_file import write_arm
@@ -50,7 +50,6 @@ MAX_TOUCH_REPROJECTION = 10.0  # px, beyond which the cameras do not show the sa
 MAX_TOUCH_SIGMAS = 4.0  # of a good point's residual
 DEAD_TIME_RANGE, DEAD_TIME_STEP = 0.03, 1e-4  # s, of the search for a virtual arm's dead time about its own
 COMPARISON_STEP = 0.005  # s between the instants compared
-_TO_RAD = np.array([1.0, 1, 1, *np.deg2rad([1.0, 1, 1])])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +71,7 @@ def read_touches(path: Path, rig: Rig) -> TouchPoints:
         checks.check_keys(path, key, entry, ("arm_mm_deg",), ("base_mm", "pixels"))
         if ("base_mm" in entry) == ("pixels" in entry):
             raise InputError(path, key + "base_mm, pixels", "both or neither", "one of the two")
-        axes.append(checks.numbers(path, key + "arm_mm_deg", entry["arm_mm_deg"], (6,), "mm and degrees") * _TO_RAD)
+        axes.append(checks.numbers(path, key + "arm_mm_deg", entry["arm_mm_deg"], (6,), "mm and degrees") * AXIS_UNITS)
         if "base_mm" in entry:
             points.append(checks.numbers(path, key + "base_mm", entry["base_mm"], (3,), "mm"))
             sigma.append(TOUCH_SIGMA)
@@ -100,23 +99,6 @@ def _point_from_pixels(path: Path, key: str, value: object, rig: Rig) -> tuple[A
     return point[0], CLICK_SIGMA * float(np.sqrt(np.trace(covariance[0]) / 3))
 
 
-@dataclass(frozen=True, slots=True)
-class ArmCalibrationOptions:
-    """Options of an arm's calibration."""
-
-    limit: float = MAX_TIP_ERROR  # mm, one sigma of the tip
-    unknowns: ArmUnknowns = field(default_factory=ArmUnknowns)
-    moves: MoveOptions = field(default_factory=MoveOptions)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmCalibrationResult:
-    """The verdict on a calibrated arm, and the text for the terminal."""
-
-    verdict: CalibrationVerdict
-    text: str
-
-
 def check_out(out: Path) -> None:
     """InputError unless `out` can be an arm file."""
     if out.suffix != ".toml":
@@ -142,26 +124,29 @@ def copy_rig_json(rig: Path, folder: Path) -> None:
 
 
 def run_folder(
-    folder: Path, out: Path, options: ArmCalibrationOptions, report: ProgressReport, truth: ArmTruth | None = None
-) -> ArmCalibrationResult:
-    """Solve a recorded calibration; writes `out` and, beside it, .report.html and .json."""
+    folder: Path, out: Path, limit: float, unknowns: ArmUnknowns, report: ProgressReport, truth: ArmTruth | None = None
+) -> tuple[CalibrationVerdict, str]:
+    """Solve a recorded calibration; writes `out` and, beside it, .report.html and .json.
+
+    limit: mm, one sigma of the tip. Returns the verdict, and the text for the terminal.
+    """
     check_out(out)
     rig_json = folder / RIG_JSON
-    result = solve_folder(folder, rig_json if rig_json.is_file() else None, options.unknowns, report)
-    verdict = judge_arm(result, options.limit)
-    profile = calibrated_profile(result.profile, result.fit.state, options.unknowns)
+    result = solve_folder(folder, rig_json if rig_json.is_file() else None, unknowns, report)
+    verdict = judge_arm(result, limit)
+    profile = calibrated_profile(result.profile, result.fit.state, unknowns)
     against = () if truth is None else truth.rows(result)
     write_arm(out, profile, f"calibrated by what cameras saw of its tip\n{verdict.lines[0]}")
     out.with_suffix(".json").write_text(numbers_text(result), encoding="utf-8")
     text = arm_page(folder.resolve().name, result, verdict, against)
     out.with_suffix(".report.html").write_text(text, encoding="utf-8")
-    return ArmCalibrationResult(verdict, arm_text(result, verdict, against, out))
+    return verdict, arm_text(result, verdict, against, out)
 
 
 def calibrate_touched(
     points_file: Path, rig_file: Path, profile: ArmProfile, out: Path, keep_tool: bool
-) -> ArmCalibrationResult:
-    """Calibrate an arm's pose from points that its tip has touched; writes `out`."""
+) -> tuple[CalibrationVerdict, str]:
+    """Calibrate an arm's pose from points that its tip has touched; writes `out`. Returns as `run_folder`."""
     check_out(out)
     points = read_touches(points_file, read_rig(rig_file).rig)
     poses = kinematics_of(profile.arm)(points.axes)
@@ -170,7 +155,7 @@ def calibrate_touched(
     arm = replace(profile.arm, arm_from_base=se3.inverse(result.base_from_arm), tool_offset=result.tool)
     write_arm(out, replace(profile, arm=arm), f"calibrated by {len(points.points)} touched points\n{verdict.lines[0]}")
     text = ["PASS" if verdict.passed else "FAIL", *verdict.lines, *verdict.hints, f"arm file: {out}"]
-    return ArmCalibrationResult(verdict, "\n".join(text))
+    return verdict, "\n".join(text)
 
 
 def _judge_touches(result: TouchFit, points: TouchPoints, poses: Array) -> CalibrationVerdict:

@@ -7,7 +7,6 @@ missing while the board is still being waved, before anything is calibrated.
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ from estimation.calibration.camera_rig import Calibration
 from estimation.calibration.lens_fit import MIN_PLANE_CORNERS, focal_from_terms, focal_terms, homography, poses
 from estimation.se3 import Array
 from hardware.files.session import Session
-from hardware.process.progress import ProgressReport
+from hardware.process.progress import ProgressReport, write_atomically
 from perception.boards.board import Board, BoardCorners, CornerFinder, CornerTable, empty_table
 from perception.frames import Image
 
@@ -69,10 +68,12 @@ def read_corners(path: Path, key: str) -> CornerTable | None:
 
 def write_corners(path: Path, key: str, table: CornerTable) -> None:
     """Store the corners atomically."""
-    partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as stream:
-        np.savez_compressed(stream, key=np.array(key), **{f.name: getattr(table, f.name) for f in fields(table)})
-    os.replace(partial, path)
+
+    def write(part: Path) -> None:
+        with part.open("wb") as stream:  # to a name that does not end in .npz numpy would add that
+            np.savez_compressed(stream, key=np.array(key), **{f.name: getattr(table, f.name) for f in fields(table)})
+
+    write_atomically(path, write)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,11 +159,6 @@ class BoardCoverage:
     depth: float  # ratio of the far views' distance to the near ones', 1 without views
 
 
-def coverage_of(pixels: Array, size: tuple[int, int], camera_from_board: Array) -> BoardCoverage:
-    """Coverage by views with corners (V, P, 2) px, nan where not seen, and poses (V, 4, 4); size: (W, H) px."""
-    return coverage_from_parts(parts_of(pixels, size), board_orientations(camera_from_board))
-
-
 def coverage_from_parts(parts: Array, orientations: Array) -> BoardCoverage:
     """Coverage by numbers of corners in the parts (rows, columns) and the board's orientations (V, 3)."""
     if not len(orientations):
@@ -192,7 +188,7 @@ def coverage(calibration: Calibration, camera: int) -> BoardCoverage:
     views, state = calibration.views, calibration.fit.state
     rows = views.camera == camera
     camera_from_board = se3.inverse(state.base_from_camera[camera]) @ state.base_from_board[views.instant[rows]]
-    return coverage_of(views.pixels[rows], views.sizes[camera], camera_from_board)
+    return coverage_from_parts(parts_of(views.pixels[rows], views.sizes[camera]), board_orientations(camera_from_board))
 
 
 def missing_coverage(name: str, covered: BoardCoverage) -> list[tuple[float, str]]:

@@ -29,8 +29,7 @@ from hardware.calibration.arm_record import (
     ArmDrive,
     CommandedFile,
     MoveOptions,
-    PictureWriter,
-    await_pictures,
+    arm_before_cameras,
     check_moves,
     read_commanded,
     straight_move,
@@ -313,23 +312,13 @@ def record_live(
 ) -> None:
     """Draw the lines before live cameras. where: as `stands` and `away` of `draw_lines`."""
     write_arm(folder / ARM_FILE, profile, "the arm as it was taken to be while a dispenser was calibrated")
-    with live:
-        arm = Arm(driver, profile, clock.now(), link)
-        writer = PictureWriter(live, rig, clock, folder)
-        writer.keep = False
-        writer.start()
+    with arm_before_cameras(live, rig, driver, profile, clock, folder, link, keep=False) as (arm, writer):
 
         def look(wanted: bool) -> None:
             writer.check()
             writer.keep = wanted
 
-        try:
-            await_pictures(writer, arm, clock)
-            draw_lines(arm, dispenser, clock, folder, *where, options, celsius, look, report)
-        finally:
-            writer.end()
-            arm.close()
-    writer.check()
+        draw_lines(arm, dispenser, clock, folder, *where, options, celsius, look, report)
 
 
 def record_virtual(

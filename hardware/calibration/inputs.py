@@ -89,7 +89,6 @@ def why_unseen(pictures: list[Image], board: Board) -> str:
 
 
 def _count_showing(pictures: list[Image], board: Board) -> int:
-    """How many pictures show a board."""
     finder = CornerFinder(board)
     return sum(finder(picture).count >= MIN_CORNERS for picture in pictures)
 

@@ -35,35 +35,29 @@ from hardware.cameras.feed import CameraPhase, CameraPlace, LiveHealth
 from hardware.cameras.live import places_without_rig, sources_named
 from hardware.cameras.sources import CameraSource
 from hardware.files.rig_file import MIN_RIG_SPAN, ImageSource, read_rig
-from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
-from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import OperatorLink, WavingCamera, WavingStage, WavingView
-from hardware.operator.view import RequestAnswer, Wish, refusal
+from hardware.operator.process import CameraShot, StatusPage
+from hardware.operator.shared_state import WavingCamera, WavingStage, WavingView
+from hardware.operator.view import Wish
 from hardware.process.clock import Clock
 from hardware.process.progress import Progress
 from perception.boards.board import Board, CornerTable
 from perception.frames import FrameSet, Image
 
-INITIAL_VIEW = WavingView(0.0, 1, WavingStage.WAVE)
-LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 OPENING_TIMEOUT = 15.0  # s until every camera has shown a picture
 WAVING_POLL = 0.5  # s between checks of the time
 RUN_GAP = 2 * MAX_INSTANT_GAP  # s put between the corners of two runs: the board's motion is not interpolated there
 RECENT_PICTURES = 5  # of each camera
 
 
-class WavingPage:
-    """The page beside a live calibration, as a context; `address` is for the browser. Nothing here waits for it."""
+class WavingPage(StatusPage):
+    """The page beside a live calibration, as a context."""
 
     def __init__(self, clock: Clock) -> None:
-        self._clock, self._link = clock, OperatorLink()
-        self._page = OperatorPage(self._link, OperatorSettings(page="waving.html"))
-        self._taker = Thumbnailer(self._link.pictures, self._link.requests, near=False)
-        self._view = INITIAL_VIEW
-        self.address = self._page.address
+        super().__init__(clock, "waving.html")
+        self._view = WavingView(0.0, 1, WavingStage.WAVE, offers=(Wish.END,))
 
     def __enter__(self) -> WavingPage:
-        self._page.tend(self._clock.now())
+        self.page.tend(self.clock.now())
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
@@ -71,10 +65,7 @@ class WavingPage:
             self.enter(WavingStage.STOPPED, "the corners are kept; the same command goes on from there")
         elif error is not None:
             self.enter(WavingStage.FAILED, str(error))
-        if self._link.requests.windows:
-            self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
-        self._taker.close()
-        self._page.close()
+        self.close()
 
     def show(self, guide: CoverageGuide, hints: tuple[str, ...], looked: int, seen: Mapping[int, Array]) -> None:
         """Show the guide's state. looked: frame sets so far. seen: corners (P, 2) px of the newest one, by camera."""
@@ -87,29 +78,20 @@ class WavingPage:
         nothing = np.zeros((0, 2))
         corners = {c: pixels[np.isfinite(pixels[:, 0])] for c, pixels in seen.items()}
         shots = [CameraShot(names[f.camera], f.image, tracks=corners.get(f.camera, nothing)) for f in one.frames]
-        self._taker.offer(one.stamp, shots)
+        self.thumbnailer.offer(one.stamp, shots)
 
     def enter(self, stage: WavingStage, *lines: str) -> None:
         """Enter a stage in which nothing can be requested any more."""
-        self._put(replace(self._view, turn=self._view.turn + 1, stage=stage, words=lines, hints=()))
+        self._put(replace(self._view, turn=self._view.turn + 1, stage=stage, words=lines, hints=(), offers=()))
 
     def poll(self) -> Wish | None:
         """STOP or END if a window has requested it; keeps the page alive."""
-        self._page.tend(self._clock.now())
-        wish = None
-        for request in self._link.requests.take():
-            why = refusal(request.wish, request.turn, self._offers(), self._view.turn)
-            self._put(replace(self._view, answer=RequestAnswer(request.number, request.wish, not why, why)))
-            wish = wish if why else request.wish
-        return wish
-
-    def _offers(self) -> tuple[Wish, ...]:
-        return (Wish.END,) if self._view.stage is WavingStage.WAVE else ()
+        wishes = self.wishes(self._view)
+        return wishes[-1] if wishes else None
 
     def _put(self, view: WavingView) -> None:
-        self._view = view  # its stage decides what is offered
-        self._view = replace(view, stamp=self._clock.now(), offers=self._offers())
-        self._link.views.put(self._view)
+        self._view = replace(view, stamp=self.clock.now())
+        self.link.views.put(self._view)
 
 
 def _camera(guide: CoverageGuide, camera: int, pixels: Array | None) -> WavingCamera:

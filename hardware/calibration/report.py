@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -18,7 +17,18 @@ from estimation.calibration.lens_model import PARAMETERS, lens_parameters, proje
 from estimation.calibration.validation import VolumeError
 from estimation.se3 import Array
 from hardware.calibration.corners import coverage
-from hardware.report.page import document, figures_table, legend, row_of_tiles, section, tile
+from hardware.report.evaluation import finite
+from hardware.report.page import (
+    camera_pictures,
+    captioned,
+    document,
+    figure_row,
+    figures_table,
+    legend,
+    row_of_tiles,
+    section,
+    tile,
+)
 
 MAX_PREDICTED_ERROR = 0.1  # mm: what printing needs of the rig in the working volume, one sigma in 3D
 MAX_RESIDUAL = 0.5  # px, median of the corners
@@ -36,15 +46,12 @@ class CalibrationVerdict:
     hints: tuple[str, ...]  # what to do; empty if passed
 
 
-def median_residual(calibration: Calibration, camera: int | None = None) -> float:
-    """Median reprojection error, px, of one camera or of all."""
-    away = np.linalg.norm(calibration.fit.residuals, axis=-1)
-    return float(np.nanmedian(away if camera is None else away[calibration.views.camera == camera]))
+def median_residual(calibration: Calibration, camera: int | None = None, held_out: bool = False) -> float:
+    """Median reprojection error, px, of one camera or of all; NaN of no view.
 
-
-def held_out_residual(calibration: Calibration, camera: int | None = None) -> float:
-    """The same under rigs calibrated without the view's own stretch of the recording."""
-    away = np.linalg.norm(calibration.held_out, axis=-1)
+    held_out: under rigs calibrated without the view's own stretch of the recording.
+    """
+    away = np.linalg.norm(calibration.held_out if held_out else calibration.fit.residuals, axis=-1)
     away = away if camera is None else away[calibration.views.camera == camera]
     return float(np.nanmedian(away)) if np.isfinite(away).any() else float("nan")
 
@@ -58,7 +65,7 @@ def judge_rig(calibration: Calibration, error: VolumeError, limit: float, hints:
         f"{word} to print: points in the working volume are off by {error.typical:.3f} mm (one sigma), 19 of 20 by "
         f"less than {spread:.3f} mm; {limit:g} mm is allowed",
         f"corners lie {off:.2f} px from where they should (median); {MAX_RESIDUAL:g} px is allowed; "
-        f"{held_out_residual(calibration):.2f} px in stretches of the recording that were held out",
+        f"{median_residual(calibration, held_out=True):.2f} px in stretches of the recording that were held out",
     ]
     if calibration.jitter:
         lines.append(f"pictures are late by {1e3 * calibration.jitter:.1f} ms each for itself: the cameras run free")
@@ -109,16 +116,6 @@ def bullets(lines: Iterable[str]) -> str:
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
-def figure(drawing: str, caption: str) -> str:
-    """A figure with its caption in HTML."""
-    return f"<figure>{drawing}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def figure_row(figures: Iterable[str]) -> str:
-    """Figures side by side in HTML."""
-    return f'<div class="pictures">{"".join(figures)}</div>'
-
-
 def picture_frame(size: tuple[int, int], inside: str, label: str = "picture") -> str:
     """A frame as large as a picture (W, H) px, with what is drawn in it, in SVG."""
     w, h = size
@@ -153,7 +150,7 @@ def page(
     ]
     if pictures:
         text = "Undistorted with getOptimalNewCameraMatrix, alpha = 1 (thesis, Figure 4.5)."
-        body.append(section("Without distortion", text, _pictures(pictures)))
+        body.append(section("Without distortion", text, camera_pictures(pictures.items())))
     footer = "Lengths in mm, base = the first camera's place. Distortion models were chosen by error on views held out."
     return document("stillbed calibrate cameras", title, f"Calibration {word}: {verdict.lines[0]}.", body, footer)
 
@@ -172,11 +169,12 @@ def _cameras(result: Calibration) -> str:
     lone = [next((s.held_out for s in result.scores[c] if s.model == result.models[c]), np.nan) for c in cameras]
     lenses = [lens_parameters(camera) for camera in result.rig.cameras]
     sigmas = [np.sqrt(np.diag(result.covariance_of(c))) for c in cameras]
+    held_out = [median_residual(result, c, held_out=True) for c in cameras]
     rows = [
         ["views", *(str(int((result.views.camera == c).sum())) for c in cameras)],
         ["distortion model", *result.models],
         ["residual, median px", *(f"{median_residual(result, c):.2f}" for c in cameras)],
-        ["in stretches held out of the whole, median px", *(f"{held_out_residual(result, c):.2f}" for c in cameras)],
+        ["in stretches held out of the whole, median px", *(f"{v:.2f}" for v in held_out)],
         ["lens alone, on views held out, RMS px", *(f"{v:.3f}" if np.isfinite(v) else "–" for v in lone)],
     ]
     for i, name in enumerate(PARAMETERS):
@@ -200,7 +198,7 @@ def _left_out(result: Calibration, dropped: Mapping[tuple[str, str], int]) -> st
 
 def _each(result: Calibration, draw: Callable[[Calibration, int], str]) -> str:
     cameras = zip(result.views.names, result.views.sizes, strict=True)
-    return figure_row(figure(picture_frame(s, draw(result, c)), name) for c, (name, s) in enumerate(cameras))
+    return figure_row(captioned(picture_frame(s, draw(result, c)), name) for c, (name, s) in enumerate(cameras))
 
 
 def _corners(result: Calibration, camera: int) -> str:
@@ -252,18 +250,12 @@ def _layer(values: Array, z: float) -> str:
         place = f'x="{20 * x + 1}" y="{20 * y + 1}" width="18" height="18"'
         cells.append(f'<rect style="fill:{fill}" {place}><title>{words}</title></rect>')
     box = f'<svg class="plot heat" viewBox="0 0 {20 * GRID_SIDE} {20 * GRID_SIDE}">{"".join(cells)}</svg>'
-    return figure(box, f"z = {z:.0f} mm")
+    return captioned(box, f"z = {z:.0f} mm")
 
 
 def _key(fill: str, words: str) -> str:
     patch = f'<svg viewBox="0 0 18 10"><rect style="fill:{fill}" width="18" height="10"/></svg>'
     return f"<span>{patch}{escape(words)}</span>"
-
-
-def _pictures(pictures: Mapping[str, bytes]) -> str:
-    images = {name: base64.b64encode(data).decode() for name, data in pictures.items()}
-    tags = {name: f'<img alt="{escape(name)}" src="data:image/jpeg;base64,{text}"/>' for name, text in images.items()}
-    return figure_row(figure(tag, name) for name, tag in tags.items())
 
 
 def rig_json(result: Calibration, error: VolumeError, verdict: CalibrationVerdict) -> str:
@@ -275,7 +267,7 @@ def rig_json(result: Calibration, error: VolumeError, verdict: CalibrationVerdic
             "model": result.models[i],
             "sigma": dict(zip(numbers, np.sqrt(np.diag(result.covariance_of(i))).tolist(), strict=True)),
             "residual_median_px": median_residual(result, i),
-            "residual_held_out_median_px": _finite_or_none(held_out_residual(result, i)),
+            "residual_held_out_median_px": median_residual(result, i, held_out=True),
             "lens_held_out_rms_px": {s.model: s.held_out for s in result.scores[i]},
             "mm_per_px": millimetres_per_pixel(result, i),
         }
@@ -285,18 +277,14 @@ def rig_json(result: Calibration, error: VolumeError, verdict: CalibrationVerdic
         "passed": verdict.passed,
         "predicted_error_mm": {"typical": error.typical, "worst": error.worst},
         "residual_median_px": median_residual(result),
-        "residual_held_out_median_px": _finite_or_none(held_out_residual(result)),
+        "residual_held_out_median_px": median_residual(result, held_out=True),
         "board_distances_rms_mm": board_scatter(result),
         "jitter_s": result.jitter,
         "numbers": numbers,
         "cameras": cameras,
         "covariance": result.fit.covariance.tolist(),
     }
-    return json.dumps(table, indent=1, allow_nan=False) + "\n"
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    return json.dumps(finite(table), indent=1, allow_nan=False) + "\n"
 
 
 def rig_text(

@@ -301,12 +301,11 @@ class RigFormat:
 
     read: Callable[[Path], Rig]
     write: Callable[[Path, Rig], None]
-    folder: bool  # whether it is a folder with a file per camera
 
 
 FORMATS = {
-    "opencv": RigFormat(read_opencv, write_opencv, True),
-    "ros": RigFormat(read_ros, write_ros, True),
-    "kalibr": RigFormat(read_kalibr, write_kalibr, False),
-    "anipose": RigFormat(read_anipose, write_anipose, False),
+    "opencv": RigFormat(read_opencv, write_opencv),
+    "ros": RigFormat(read_ros, write_ros),
+    "kalibr": RigFormat(read_kalibr, write_kalibr),
+    "anipose": RigFormat(read_anipose, write_anipose),
 }

@@ -26,9 +26,10 @@ from hardware.cli.parser import (
 from hardware.process.progress import check_new, left_files_text
 
 if TYPE_CHECKING:
+    from hardware.calibration.arm_record import MoveOptions
     from hardware.calibration.arm_report import ArmTruth
-    from hardware.calibration.arm_run import ArmCalibrationOptions, ArmCalibrationResult
     from hardware.calibration.live import WavingPage
+    from hardware.calibration.report import CalibrationVerdict
     from hardware.process.clock import Clock
 
 RIG_FORMATS = {
@@ -243,7 +244,8 @@ def _add_arm(parts: Commands) -> None:
     add("--cameras", type=Path, metavar="RIG.toml", help="the calibrated cameras, with their sources")
     add("--arm", type=Path, metavar="ARM.toml", help="arm file with limits, home, dialect and, if known, lag")
     add("--record", type=Path, metavar="FOLDER", help="output folder for pictures and commands, new")
-    add("--limit-mm", type=positive, default=0.1, metavar="MM", help="maximum error of the tip for PASS; default 0.1")
+    limit_help = "maximum error of the tip for PASS; default 0.1"
+    add("--limit-mm", type=positive, default=0.1, metavar="MM", help=limit_help)  # a fourth of a bead
     add("--keep-tool", action="store_true", help="do not estimate the tool offset: no rotations")
     add("--keep-latency", action="store_true", help="do not estimate dead time and lag")
     add = part.add_argument_group("the moves").add_argument
@@ -273,7 +275,7 @@ def _calibrate_arm(a: argparse.Namespace) -> int:
         if getattr(a, name) is None:
             raise option_error(f"--{name}", "missing", f"given with {source}")
     try:
-        outcome = {"device": _from_device, "virtual": _virtual, "touched": _touched, "folder": _folder}[source](a)
+        verdict, text = {"device": _from_device, "virtual": _virtual, "touched": _touched, "folder": _folder}[source](a)
     except KeyboardInterrupt:
         if "record" not in ARM_SOURCES[source] or not (a.record.is_dir() and any(a.record.iterdir())):
             raise
@@ -282,37 +284,36 @@ def _calibrate_arm(a: argparse.Namespace) -> int:
             hint = f"`stillbed calibrate arm {quote(str(a.record))} -o {quote(str(a.out))}` takes what is there; {hint}"
         print(f"\nstillbed: interrupted; {left_files_text(a.record)}; {hint}", file=sys.stderr)
         return INTERRUPTED
-    print(outcome.text)
-    return 0 if outcome.verdict.passed else FAILED
+    print(text)
+    return 0 if verdict.passed else FAILED
 
 
-def _arm_options(a: argparse.Namespace) -> ArmCalibrationOptions:
+def _moves(a: argparse.Namespace) -> MoveOptions:
     import numpy as np
 
-    from estimation.calibration.arm_fit import ArmUnknowns
     from hardware.calibration.arm_record import MoveOptions
-    from hardware.calibration.arm_run import ArmCalibrationOptions
 
     max_rotation = 0.0 if a.keep_tool else float(np.deg2rad(a.turn_deg))
     swing = 0.0 if a.keep_latency else a.swing_s
-    moves = MoveOptions(a.places, a.reach_mm, a.up_mm, a.down_mm, max_rotation, a.speed_mm_s, a.dwell_s, swing)
-    return ArmCalibrationOptions(a.limit_mm, ArmUnknowns(tool=not a.keep_tool, latency=not a.keep_latency), moves)
+    return MoveOptions(a.places, a.reach_mm, a.up_mm, a.down_mm, max_rotation, a.speed_mm_s, a.dwell_s, swing)
 
 
-def _folder(a: argparse.Namespace, truth: ArmTruth | None = None) -> ArmCalibrationResult:
+def _folder(a: argparse.Namespace, truth: ArmTruth | None = None) -> tuple[CalibrationVerdict, str]:
     """Solve the named folder, or the one that was just recorded. truth: of a virtual arm."""
+    from estimation.calibration.arm_fit import ArmUnknowns
     from hardware.calibration.arm_run import run_folder
 
+    unknowns = ArmUnknowns(tool=not a.keep_tool, latency=not a.keep_latency)
     with progress_bar("tips", "frame sets") as progress:
-        return run_folder(a.folder or a.record, a.out, _arm_options(a), progress, truth)
+        return run_folder(a.folder or a.record, a.out, a.limit_mm, unknowns, progress, truth)
 
 
-def _virtual(a: argparse.Namespace) -> ArmCalibrationResult:
+def _virtual(a: argparse.Namespace) -> tuple[CalibrationVerdict, str]:
     from hardware.calibration.arm_run import check_out, check_record, record_in_virtual_time, record_on_terminal
     from hardware.simulator.watched_arm import watched_arm
 
     check_out(a.out)
-    options = _arm_options(a).moves
+    options = _moves(a)
     check_record(a.record)
     with progress_bar("moves", "ticks") as moves, progress_bar("pictures", "frame sets") as pictures:
         watched = watched_arm(a.seed)
@@ -323,7 +324,7 @@ def _virtual(a: argparse.Namespace) -> ArmCalibrationResult:
     return _folder(a, truth)
 
 
-def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
+def _from_device(a: argparse.Namespace) -> tuple[CalibrationVerdict, str]:
     from hardware.arm.console import axes_from_text
     from hardware.arm.profile import LinkSettings, open_arm
     from hardware.calibration.arm_record import record_live
@@ -334,22 +335,19 @@ def _from_device(a: argparse.Namespace) -> ArmCalibrationResult:
     if not a.yes:
         raise InputError("arm", "--yes", "missing", "the confirmation that nobody is within the arm's reach")
     check_out(a.out)
-    options, clock, profile = _arm_options(a).moves, wall_clock(), arm_profile(a.arm)
+    options, clock, profile = _moves(a), wall_clock(), arm_profile(a.arm)
     position = None if a.stands is None else axes_from_text(a.stands, profile.arm.home)
     rig, sources = read_live_rig(a.cameras)
     check_record(a.record)
     copy_rig_json(a.cameras, a.record)
     driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
-    try:
-        with progress_bar("moves", "ticks") as moves:
-            live = LiveCameras(rig, sources, clock)
-            record_live(live, rig, driver, profile, clock, a.record, position, options, moves, link)
-    finally:
-        driver.release()
+    with progress_bar("moves", "ticks") as moves:
+        live = LiveCameras(rig, sources, clock)
+        record_live(live, rig, driver, profile, clock, a.record, position, options, moves, link)
     return _folder(a)
 
 
-def _touched(a: argparse.Namespace) -> ArmCalibrationResult:
+def _touched(a: argparse.Namespace) -> tuple[CalibrationVerdict, str]:
     from hardware.calibration.arm_run import calibrate_touched
 
     return calibrate_touched(a.touched, a.cameras, arm_profile(a.arm), a.out, a.keep_tool)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,15 +96,9 @@ def _serve(a: argparse.Namespace) -> int:
 
 
 def _connect(a: argparse.Namespace) -> int:
-    from hardware.files.dispenser_file import dispenser_from_settings, read_dispensers
+    from hardware.files.dispenser_file import dispenser_from_settings
 
-    path = named_path(a.which)
-    dispensers = read_dispensers(path)
-    if a.name is not None:
-        names = [each.profile.name for each in dispensers]
-        dispensers = tuple(each for each in dispensers if each.profile.name == a.name)
-        if not dispensers:
-            raise option_error("--name", a.name, f"one of {', '.join(names)}")
+    dispensers = _selected(named_path(a.which), a.name, single=a.on is not None)
     if a.on is None:
         for option in ("flow", "celsius", "yes"):
             if getattr(a, option):
@@ -113,8 +106,6 @@ def _connect(a: argparse.Namespace) -> int:
         return max(listen(each, a.seconds or 5.0, wall_clock()) for each in dispensers)
     if a.seconds is not None:
         raise option_error("--seconds", a.seconds, "only without --on S")
-    if len(dispensers) > 1:
-        raise option_error("--name", "missing", f"one of {', '.join(each.profile.name for each in dispensers)}")
     if a.on > MAX_OPEN:
         raise option_error("--on", a.on, f"at most {MAX_OPEN:g} s")
     if not a.yes:
@@ -150,12 +141,12 @@ def watchdog_text(profile: DispenserProfile) -> str:
     return "HAS NO WATCHDOG: it stays on when this machine or its cable fails; have a switch at hand"
 
 
-def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Callable[[str], None] = print) -> int:
+def listen(settings: DispenserSettings, seconds: float, clock: Clock) -> int:
     """Print the messages of a device, and send nothing; exit code."""
     from hardware.dispenser.dispenser import DispenserState
     from hardware.dispenser.line_dispenser import LineDispenser
 
-    say(description(settings))
+    print(description(settings))
     if settings.line is None:
         return 0
     dispenser = LineDispenser(settings.profile, settings.line)
@@ -167,22 +158,15 @@ def listen(settings: DispenserSettings, seconds: float, clock: Clock, say: Calla
     status, messages = dispenser.status, list(dispenser.heard)
     dispenser.hang_up()
     if status.state is DispenserState.FAILED:
-        say(f"  failed: {status.reason}")
+        print(f"  failed: {status.reason}")
         return FAILED
-    say(f"  its line is open; it said {len(messages)} lines in {seconds:g} s, and was sent nothing")
+    print(f"  its line is open; it said {len(messages)} lines in {seconds:g} s, and was sent nothing")
     for stamp, text in messages:
-        say(f"  {stamp - start:.3f} s: {text}")
+        print(f"  {stamp - start:.3f} s: {text}")
     return 0
 
 
-def open_for(
-    dispenser: Dispenser,
-    seconds: float,
-    flow: float | None,
-    celsius: float | None,
-    clock: Clock,
-    say: Callable[[str], None] = print,
-) -> int:
+def open_for(dispenser: Dispenser, seconds: float, flow: float | None, celsius: float | None, clock: Clock) -> int:
     """Prepare a dispenser, open it for `seconds` s, and close it in every case; exit code."""
     from hardware.dispenser.dispenser import Dispensers, DispenserState, close_dispensers
 
@@ -196,27 +180,27 @@ def open_for(
     def wait(end: float, state: DispenserState) -> bool:
         while (now := clock.now()) < end and dispenser.status.state is state:
             dispenser.poll(now)
-            _tell(dispenser, start, say)
+            _tell(dispenser, start)
             clock.wait_until(now + DISPENSER_POLL)
         return dispenser.status.state is not DispenserState.FAILED
 
-    say(watchdog_text(profile))
+    print(watchdog_text(profile))
     try:
         dispenser.prepare(start, celsius)
         succeeded = wait(start + PREPARE_TIME, DispenserState.PREPARING)
         if succeeded and (reason := dispenser.on(flow, clock.now())):
-            say(reason)
+            print(reason)
             succeeded = False
         succeeded = succeeded and wait(clock.now() + seconds, DispenserState.ON)
     finally:
         failure = close_dispensers(Dispensers([dispenser]), clock)
-        _tell(dispenser, start, say)
+        _tell(dispenser, start)
     return 0 if succeeded and not failure else FAILED
 
 
-def _tell(dispenser: Dispenser, start: float, say: Callable[[str], None]) -> None:
+def _tell(dispenser: Dispenser, start: float) -> None:
     for event in dispenser.events():
-        say(f"{event.stamp - start:.3f} s: {event.text}")
+        print(f"{event.stamp - start:.3f} s: {event.text}")
 
 
 def add_calibrate_dispenser(parts: Commands) -> None:
@@ -296,7 +280,7 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
         if getattr(a, name) is None:
             raise option_error(f"--{name}", "missing", f"given with --{sources[0]}")
     options = LineOptions(a.speeds, a.lines, a.length_mm, a.spacing_mm, a.height_mm, a.area_mm2)
-    settings = _named(a)
+    (settings,) = _selected(a.file, a.name, single=True)
     if a.virtual:
         from dataclasses import replace
 
@@ -320,17 +304,16 @@ def _calibrate_dispenser(a: argparse.Namespace) -> int:
     return 0 if verdict.passed else FAILED
 
 
-def _named(a: argparse.Namespace) -> DispenserSettings:
-    """The dispenser of the file that --name selects."""
+def _selected(file: Path, name: str | None, single: bool) -> list[DispenserSettings]:
+    """The dispensers of a file, or the one that --name selects. single: whether it has to be one."""
     from hardware.files.dispenser_file import read_dispensers
 
-    dispensers = read_dispensers(a.file)
-    selected = [each for each in dispensers if a.name in (None, each.profile.name)]
-    if len(selected) != 1:
-        raise option_error(
-            "--name", a.name or "missing", f"one of {', '.join(each.profile.name for each in dispensers)}"
-        )
-    return selected[0]
+    dispensers = read_dispensers(file)
+    selected = [each for each in dispensers if name in (None, each.profile.name)]
+    if not selected or (single and len(selected) > 1):
+        names = ", ".join(each.profile.name for each in dispensers)
+        raise option_error("--name", name or "missing", f"one of {names}")
+    return selected
 
 
 def _draw_virtual(a: argparse.Namespace, settings: DispenserSettings, options: LineOptions) -> str:
@@ -365,12 +348,7 @@ def _draw(a: argparse.Namespace, settings: DispenserSettings, options: LineOptio
     rig, sources = read_live_rig(a.cameras)
     dispenser = dispenser_from_settings(settings)
     driver, link = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
-    try:
-        with progress_bar("lines", "ticks") as progress:
-            live = LiveCameras(rig, sources, clock)
-            record_live(
-                live, rig, driver, profile, dispenser, clock, a.record, places, options, a.celsius, progress, link
-            )
-    finally:
-        driver.release()
+    with progress_bar("lines", "ticks") as progress:
+        live = LiveCameras(rig, sources, clock)
+        record_live(live, rig, driver, profile, dispenser, clock, a.record, places, options, a.celsius, progress, link)
     return watchdog_text(settings.profile)

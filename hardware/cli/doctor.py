@@ -62,14 +62,14 @@ SYSTEM_REMEDY = "install the system package with this file: `apt-file search NAM
 OPEN3D_REMEDY = f"on Debian: sudo apt-get install -y {SHARED_LIBRARIES}"
 
 
-def machine_checks(folder: Path, clock: Clock, root: Path = FILE_SYSTEM_ROOT) -> list[Check]:
-    """All checks of the machine. folder: of the recordings. root: of the file system."""
+def machine_checks(folder: Path, clock: Clock) -> list[Check]:
+    """All checks of the machine. folder: of the recordings."""
     return [
         python_check(),
-        processor_check(root),
-        memory_check(root),
+        processor_check(),
+        memory_check(),
         disk_check(folder),
-        shared_check(root),
+        shared_check(),
         priority_check(),
         punctuality_check(clock),
         evenness_check(clock),
@@ -141,21 +141,21 @@ def priority_check() -> Check:
     return _check("priority", text not in (NO_PRIORITY, NO_ANSWER), text, PRIORITY_REMEDY)
 
 
-def punctuality_check(clock: Clock, ticks: int = PROBE_TICKS) -> Check:
+def punctuality_check(clock: Clock) -> Check:
     """The lateness of ticks on this machine."""
     lateness = Histogram()
     start = clock.now()
-    for k in range(1, ticks + 1):
+    for k in range(1, PROBE_TICKS + 1):
         clock.wait_until(start + k * TICK_PERIOD)
         lateness.add(clock.now() - (start + k * TICK_PERIOD))
     median, p98 = (1000 * lateness.percentile(share) for share in (50, 98))
-    text = f"{ticks} ticks of {1000 * TICK_PERIOD:g} ms: {median:.1f} ms late, {p98:.1f} at the worst"
+    text = f"{PROBE_TICKS} ticks of {1000 * TICK_PERIOD:g} ms: {median:.1f} ms late, {p98:.1f} at the worst"
     return _check("clock", p98 <= MAX_LATE_MS, text, "stop other programs; disable power saving")
 
 
-def evenness_check(clock: Clock, pieces: int = PROBE_PIECES) -> Check:
+def evenness_check(clock: Clock) -> Check:
     """The variation of the time for equal work."""
-    result = measure_evenness(clock, pieces)
+    result = measure_evenness(clock, PROBE_PIECES)
     remedy = "stop other programs; if nothing else runs, use a machine that is not shared"
     return _check("evenness", result.slow <= MAX_SLOW_SHARE, str(result), remedy)
 

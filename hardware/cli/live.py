@@ -8,8 +8,18 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
-from hardware.cli.parser import FAILED, MODEL_HELP, ROI_HELP, Commands, add_fault, arm_profile, option_error, positive
-from hardware.process.progress import check_new, json_text, write_atomically
+from hardware.cli.parser import (
+    FAILED,
+    MODEL_HELP,
+    ROI_HELP,
+    Commands,
+    add_fault,
+    arm_profile,
+    option_error,
+    positive,
+    wall_clock,
+)
+from hardware.process.progress import check_new, write_atomically
 from perception import named_path
 
 if TYPE_CHECKING:
@@ -17,9 +27,6 @@ if TYPE_CHECKING:
     from hardware.cameras.genicam import IndustrialCamera
     from hardware.cameras.sources import CameraDevice
 
-SETTINGS_FLAGS = ("rig", "simulated", "model", "path", "scan", "arm", "profile", "record", "dry_run", "lift",
-    "stands_home", "operator", "jpeg_quality", "dispensers", "foxglove_port", "page_address", "page_port",
-    "page_certificate", "page_key", "look", "adapt")  # fmt: skip
 NO_CAMERA_TEXT = """no camera is connected, or this user may not see it
   connect one: it appears in /dev/v4l/by-id, and `stillbed cameras` lists it
   in a container, pass it (docker run --device /dev/video0 -v /dev/v4l:/dev/v4l); on Linux be in the group `video`
@@ -105,36 +112,6 @@ def add_record(commands: Commands) -> None:
     add("--force", action="store_true", help="overwrite the file")
 
 
-def add_trace(commands: Commands) -> None:
-    """Add the sub-command `trace`."""
-    add = commands.add(
-        "trace",
-        _run_trace,
-        "show the processing times of a live run's slowest frame sets",
-        "Read the trace in the recording of a live run: the time of the frame sets from their pixels in memory to the\n"
-        "first move on the wire, and the work of the processes in that time, for all sets and for the slowest 1 %.",
-        "stillbed trace run.mcap -o run.json --page run.trace.html",
-    ).add_argument
-    add("recording", type=Path, metavar="X.mcap", help="recording of a live run")
-    add("-o", "--out", type=Path, metavar="X.json", help="write it for Perfetto (ui.perfetto.dev), chrome://tracing")
-    add("--page", type=Path, metavar="X.html", help="write a page: causes, and timelines of the slowest sets")
-    add("--force", action="store_true", help="overwrite these files")
-
-
-def _run_trace(a: argparse.Namespace) -> None:
-    from hardware.live.trace import chrome_trace, read_trace, trace_page, trace_text
-
-    for flag, file in (("--out", a.out), ("--page", a.page)):
-        if file is not None:
-            check_new(file, a.force, flag, a.recording)
-    trace = read_trace(a.recording)
-    print(trace_text(trace))
-    if a.out is not None:
-        a.out.write_text(chrome_trace(trace), encoding="utf-8")
-    if a.page is not None:
-        a.page.write_text(trace_page(trace, a.recording.stem), encoding="utf-8")
-
-
 def _run_record(a: argparse.Namespace) -> int:
     from hardware.files.region_table import read_region
     from hardware.live.camera_recording import CameraRecording, RecordOrder, check_order
@@ -169,21 +146,22 @@ def add_init(commands: Commands) -> None:
 
 
 def _run_live(a: argparse.Namespace) -> int:
+    from dataclasses import fields
+
     from hardware.cli.plan import scanned_settings
     from hardware.files.region_table import read_region
     from hardware.live.settings import LiveSettings, named_by_flag, override_settings, parse_host_names, read_settings
     from hardware.process.faults import faults_from_texts
 
     faults = faults_from_texts("command line", "--fault", a.fault)
-    flags = {name: getattr(a, name) for name in SETTINGS_FLAGS}
+    flags = {field.name: getattr(a, field.name, None) for field in fields(LiveSettings)}
     traces = False if a.no_trace else True if a.trace is not None else None
     flags |= {"unattended": a.yes, "page": False if a.no_page else None, "trace": traces}
+    flags["region"] = None if a.region is None else read_region(a.region)
     if a.trace is not None and a.no_trace:
         raise option_error("--trace", a.trace, "left out beside --no-trace")
     if a.trace is not None and a.trace.exists() and not a.force:
         raise option_error("--trace", a.trace, "a new file, or --force")
-    if a.region is not None:
-        flags["region"] = read_region(a.region)
     if a.page_name is not None:
         flags["page_names"] = parse_host_names("command line", "--page-name", a.page_name)
     if a.resume is not None and (a.settings is not None or a.record is not None):
@@ -222,7 +200,7 @@ def _run_init(a: argparse.Namespace) -> None:
     if file.exists():
         raise InputError(file, "FOLDER", "holds a session.toml already", "a folder without one")
     a.out.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, lambda part: part.write_text(settings_text(), encoding="utf-8"))
+    write_atomically(file, settings_text())
     print(f"edit {file}, then: stillbed live {quote(str(file))}")
 
 
@@ -293,7 +271,6 @@ def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
     from hardware.arm.console import ArmRequest, axes_from_text, jog_from_text, origin_from_text, run_arm
     from hardware.arm.device import ArmState
     from hardware.arm.profile import LinkSettings, open_arm
-    from hardware.process.clock import WallClock
 
     request = ArmRequest(
         seconds=float("inf") if a.watch else a.seconds,
@@ -305,7 +282,7 @@ def _connect_arm(a: argparse.Namespace, profile: ArmProfile) -> int:
     )
     driver, settings = open_arm(a.device, profile), LinkSettings(pause_frame=not a.no_pause_frame)
     try:
-        status = run_arm(driver, profile, request, WallClock(), settings=settings)
+        status = run_arm(driver, profile, request, wall_clock(), settings=settings)
     finally:
         driver.release()
     return 0 if status.state is ArmState.DISARMED else 1
@@ -334,13 +311,16 @@ def add_cameras(commands: Commands) -> None:
 
 
 def _run_cameras(a: argparse.Namespace) -> int:
+    import json
+
     from hardware.cameras.genicam import INSTALL, list_industrial
     from hardware.cameras.sources import list_devices
 
     if a.which:
         return _watch_cameras(a)
     devices, industrial = list_devices(), list_industrial()
-    print(json_text(_cameras_table(devices, industrial or ())) if a.json else list_text(devices, industrial or ()))
+    cameras = devices, industrial or ()
+    print(json.dumps(_cameras_table(*cameras), indent=2) if a.json else list_text(*cameras))
     if industrial is None and not a.json:
         print(f"\n{NO_ARAVIS_TEXT}\n  {INSTALL}")
     return 0
@@ -376,10 +356,11 @@ def list_text(devices: tuple[CameraDevice, ...], industrial: tuple[IndustrialCam
 
 
 def _watch_cameras(a: argparse.Namespace) -> int:
+    import json
+
     from hardware.cameras.inspection import inspect, inspection_sheet, inspection_table, inspection_text
     from hardware.cameras.live import LiveCameras, places_without_rig, sources_named
     from hardware.files.images import encode
-    from hardware.process.clock import WallClock
 
     if not 0 < a.seconds <= 3600:
         raise option_error("--seconds", a.seconds, "0 < seconds <= 3600")
@@ -388,10 +369,10 @@ def _watch_cameras(a: argparse.Namespace) -> int:
     if a.out is not None:
         check_new(a.out, a.force)
     rig, sources = sources_named(a.which)
-    clock = WallClock()
+    clock = wall_clock()
     with LiveCameras(places_without_rig(len(a.which)) if rig is None else rig, sources, clock) as live:
         inspection = inspect(live, a.seconds, clock)
-    print(json_text(inspection_table(inspection)) if a.json else inspection_text(inspection))
+    print(json.dumps(inspection_table(inspection), indent=2) if a.json else inspection_text(inspection))
     if a.out is not None:
         sheet = encode(inspection_sheet(inspection), None if a.out.suffix.lower() == ".png" else SHEET_JPEG_QUALITY)[1]
         a.out.write_bytes(sheet)

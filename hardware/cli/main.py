@@ -33,7 +33,6 @@ from hardware.process.progress import (
     FirstWord,
     cache_folder,
     fill_standard_streams,
-    json_text,
     left_files_text,
     painted,
     prepare_out,
@@ -137,6 +136,7 @@ def add_doctor(commands: Commands) -> None:
 
 
 def _run_doctor(a: argparse.Namespace) -> int:
+    import json
     from dataclasses import asdict
 
     from hardware.cli.doctor import device_checks, extras_check, library_checks, machine_checks
@@ -151,7 +151,7 @@ def _run_doctor(a: argparse.Namespace) -> int:
     parts = {"machine": machine, "libraries": libraries, "devices": [] if broken else device_checks()}
     verdicts = [check.verdict for part in parts.values() for check in part]
     if a.json:
-        print(json_text({name: [asdict(check) for check in part] for name, part in parts.items()}))
+        print(json.dumps({name: [asdict(check) for check in part] for name, part in parts.items()}, indent=2))
     else:
         print("\n\n".join(f"{name}\n{checks_table(tuple(part), sys.stdout)}" for name, part in parts.items() if part))
         print(f"\n{_verdict_text(verdicts, broken)}")
@@ -337,7 +337,7 @@ COMMANDS = {  # functions that add each
     "plan": _elsewhere("plan:add_plan"),
     "live": _elsewhere("live:add_live"),
     "record": _elsewhere("live:add_record"),
-    "trace": _elsewhere("live:add_trace"),
+    "trace": _elsewhere("sessions:add_trace"),
     "init": _elsewhere("live:add_init"),
     "replay": _elsewhere("sessions:add_replay"),
     "calibrate": _elsewhere("calibrate:add_calibrate"),

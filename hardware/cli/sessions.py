@@ -1,4 +1,4 @@
-"""`stillbed track`, `replay`, `smooth`, `compare`, `view`, `import`, `export`: recorded sessions. Imports lazily."""
+"""`stillbed track`, `replay`, `trace`, `smooth`, `compare`, `view`, `import`, `export`: recordings. Imports lazily."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hardware.cli.parser import FAILED, MODEL_HELP, Commands, add_fault, damage_code, option_error, progress_bar
-from hardware.process.progress import prepare_out
+from hardware.process.progress import check_new, prepare_out
 from perception import named_path
 from perception.tracking import MAP_METHOD, TRACKING_METHODS
 
@@ -56,6 +56,36 @@ def add_replay(commands: Commands) -> None:
     add_fault(add)
     add("-o", "--out", type=Path, required=True, help="output folder, new or empty")
     add("--force", action="store_true", help="write into a folder that is not empty")
+
+
+def add_trace(commands: Commands) -> None:
+    """Add the sub-command `trace`."""
+    add = commands.add(
+        "trace",
+        _run_trace,
+        "show the processing times of a live run's slowest frame sets",
+        "Read the trace in the recording of a live run: the time of the frame sets from their pixels in memory to the\n"
+        "first move on the wire, and the work of the processes in that time, for all sets and for the slowest 1 %.",
+        "stillbed trace run.mcap -o run.json --page run.trace.html",
+    ).add_argument
+    add("recording", type=Path, metavar="X.mcap", help="recording of a live run")
+    add("-o", "--out", type=Path, metavar="X.json", help="write it for Perfetto (ui.perfetto.dev), chrome://tracing")
+    add("--page", type=Path, metavar="X.html", help="write a page: causes, and timelines of the slowest sets")
+    add("--force", action="store_true", help="overwrite these files")
+
+
+def _run_trace(a: argparse.Namespace) -> None:
+    from hardware.live.trace import chrome_trace, read_trace, trace_page, trace_text
+
+    for flag, file in (("--out", a.out), ("--page", a.page)):
+        if file is not None:
+            check_new(file, a.force, flag, a.recording)
+    trace = read_trace(a.recording)
+    print(trace_text(trace))
+    if a.out is not None:
+        a.out.write_text(chrome_trace(trace), encoding="utf-8")
+    if a.page is not None:
+        a.page.write_text(trace_page(trace, a.recording.stem), encoding="utf-8")
 
 
 def add_import(commands: Commands) -> None:

@@ -9,14 +9,12 @@ from __future__ import annotations
 import signal
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from estimation.errors import InputError
 from estimation.rig import Rig
@@ -29,13 +27,12 @@ from hardware.live.recorder_process import RecorderSender, record
 from hardware.live.records import RecorderReport, SetEntry
 from hardware.live.settings import LiveSettings
 from hardware.offline.track import region_search
-from hardware.operator.process import CameraShot, OperatorPage, Thumbnailer
-from hardware.operator.settings import OperatorSettings
-from hardware.operator.shared_state import DrawnRegion, OperatorLink, RecordingStage, RecordingView, scene_from
-from hardware.operator.view import CameraView, CheckVerdict, RequestAnswer, Wish, refusal
+from hardware.operator.process import CameraShot, StatusPage
+from hardware.operator.shared_state import Polygons, RecordingStage, RecordingView, scene_from
+from hardware.operator.view import CameraView, CheckVerdict, Wish
 from hardware.process.clock import Clock, WallClock
 from hardware.process.progress import Progress
-from hardware.process.system import SPAWN, SharedLatest
+from hardware.process.system import SPAWN, SharedLatest, handled_signals
 from perception.frames import FrameSet, region_since
 
 if TYPE_CHECKING:  # who draws no region needs no tracker, which takes two seconds to load
@@ -46,10 +43,8 @@ READY_POLL = 0.05  # s between looks at a recorder that starts
 PICTURE_WAIT = 0.1  # s of a wait for pictures, after which signals and the page are looked at
 VIEW_PERIOD = 0.3  # s between views for the page
 SHARPNESS_PERIOD = 1.0  # s between looks at the pictures' sharpness, which takes some ms each
-LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 WRITE_TIMEOUT = 30.0  # s in which the recorder writes what waits
 BLUNT_SHARE = 0.6  # of the sharpest picture so far, below which a camera is perhaps out of focus
-ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 MEGABYTE = 1e6
 RECORDER = "recorder"
 
@@ -84,44 +79,29 @@ def check_order(order: RecordOrder, force: bool) -> RecordOrder:
     return order
 
 
-class RecordingPage:
-    """The page beside a recording; `address` is for the browser. Nothing here waits for it."""
+class RecordingPage(StatusPage):
+    """The page beside a recording."""
 
     def __init__(self, clock: Clock, rig: Rig) -> None:
-        self._clock, self.link = clock, OperatorLink()
-        self._page = OperatorPage(self.link, OperatorSettings(page="recording.html"))
-        self._thumbnailer = Thumbnailer(self.link.pictures, self.link.requests, near=False)
+        super().__init__(clock, "recording.html")
         self._names = [camera.name for camera in rig.cameras]
         self._view = RecordingView(clock.now(), 1, RecordingStage.RECORD, 0.0, 0, 0, 0)
         self.link.scene.put(scene_from(rig))
-        self.address = self._page.address
 
     def show(self, view: RecordingView) -> bool:
-        """Show the state; turn and answer are filled in here. Returns whether the end was requested on the page."""
-        previous, end_requested = self._view, False
+        """Show the state; its turn is filled in here. Returns whether the end was requested on the page."""
+        previous = self._view
         turn = previous.turn + ((previous.stage, previous.draws) != (view.stage, view.draws))
         offers = (Wish.END,) if view.stage is RecordingStage.RECORD else ()
-        self._view = replace(view, turn=turn, answer=previous.answer, offers=offers)
-        for request in self.link.requests.take():
-            reason = refusal(request.wish, request.turn, offers, turn)
-            end_requested |= not reason and request.wish in (Wish.STOP, Wish.END)
-            self._view = replace(self._view, answer=RequestAnswer(request.number, request.wish, not reason, reason))
+        self._view = replace(view, turn=turn, offers=offers)
         self.link.views.put(self._view)
-        self._page.tend(self._clock.now())
-        return end_requested
+        return bool(self.wishes(self._view))
 
     def pictures(self, frames: FrameSet) -> None:
         """Offer the pictures, where anybody has the page open."""
-        if self.link.requests.windows:
+        if self.link.status.windows:
             shots = [CameraShot(self._names[frame.camera], frame.image) for frame in frames.frames]
-            self._thumbnailer.offer(frames.stamp, shots)
-
-    def close(self) -> None:
-        """End the page, once its windows had time for the last view."""
-        if self.link.requests.windows:
-            self._clock.wait_until(self._clock.now() + LAST_VIEW_TIME)
-        self._thumbnailer.close()
-        self._page.close()
+            self.thumbnailer.offer(frames.stamp, shots)
 
 
 @dataclass(slots=True)
@@ -144,10 +124,9 @@ class Sharpness:
 class CameraRecording:
     """One recording. Call it; then `words` has its outcome as a text, and `failed` whether it was cut short."""
 
-    def __init__(self, order: RecordOrder, stream: TextIO | None = None) -> None:
-        """stream: for progress, by default stderr."""
+    def __init__(self, order: RecordOrder) -> None:
         self.words, self.failed = "", False
-        self._order, self._clock, self._stream = order, WallClock(), stream
+        self._order, self._clock = order, WallClock()
         self._signal = 0
         self._processes, self._reports = ProcessGroup(), SharedLatest[RecorderReport]()
         self._start = self._clock.now()
@@ -164,7 +143,7 @@ class CameraRecording:
     def __call__(self) -> None:
         """Record until the time is over or somebody ends it."""
         with ExitStack() as stack:
-            stack.enter_context(self._signals())
+            stack.enter_context(handled_signals(self.on_signal))
             self._source = LiveCameraSource(self._order.rig)
             stack.callback(self._source.close)
             rig = self._source.rig
@@ -174,7 +153,7 @@ class CameraRecording:
             self._sender.put(rig)
             if self._order.page:
                 self._open_page(stack, rig)
-            progress = stack.enter_context(Progress("record", "frame sets", self._clock.now, self._stream))
+            progress = stack.enter_context(Progress("record", "frame sets", self._clock.now))
             self._wait_for_recorder(progress)
             self._seek_region(stack, rig)
             reason = ""
@@ -182,18 +161,9 @@ class CameraRecording:
                 self._cycle(progress)
             self._finish(reason)
 
-    def on_signal(self, number: int, frame: FrameType | None) -> None:
+    def on_signal(self, number: int) -> None:
         """Handle a signal that asks the recording to end."""
         self._signal = number
-
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        previous = [signal.signal(number, self.on_signal) for number in ENDING_SIGNALS]
-        try:
-            yield
-        finally:
-            for number, handler in zip(ENDING_SIGNALS, previous, strict=True):
-                signal.signal(number, handler)
 
     def _start_recorder(self, stack: ExitStack) -> None:
         settings = LiveSettings(record=self._order.out, jpeg_quality=self._order.jpeg_quality)
@@ -214,13 +184,13 @@ class CameraRecording:
     def _open_page(self, stack: ExitStack, rig: Rig) -> None:
         self._page = RecordingPage(self._clock, rig)
         stack.callback(self._page.close)
-        self._say(f"open {self._page.address} to see what is recorded")
+        print(f"open {self._page.address} to see what is recorded", file=sys.stderr, flush=True)
 
     def _seek_region(self, stack: ExitStack, rig: Rig) -> None:
         """Record the region, or prepare to find it in the pictures."""
         for roi in self._order.region.rois(rig, self._start):
             self._sender.put(roi)
-        drawn = SharedLatest[DrawnRegion]() if self._page is None else self._page.link.regions
+        drawn = SharedLatest[Polygons]() if self._page is None else self._page.link.regions
         search = region_search(rig, self._order.region, drawn)
         if search is not None:
             self._find_region = search(stack.enter_context(ThreadPoolExecutor(1)))
@@ -337,9 +307,6 @@ class CameraRecording:
     def _span(self) -> str:
         seconds = self._last_stamp - self._first_stamp
         return f"of {seconds:.1f} s, {self._size() / MEGABYTE:.1f} MB"
-
-    def _say(self, text: str) -> None:
-        print(text, file=sys.stderr if self._stream is None else self._stream, flush=True)
 
 
 def _losses(state: CameraState) -> str:

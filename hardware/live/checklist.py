@@ -232,7 +232,6 @@ def _material_check(report: LiveMotionReport | None) -> tuple[Check, ...]:
 
 
 def _reach_check(placed_path: PlacedPath | None) -> Check:
-    """Whether the arm reaches the path where the surface is."""
     if placed_path is None:
         return Check("reach", BUSY, "the surface is not found yet")
     if placed_path.unreachable:
@@ -241,7 +240,6 @@ def _reach_check(placed_path: PlacedPath | None) -> Check:
 
 
 def _recorder_check(report: RecorderReport | None) -> Check:
-    """Whether the recorder writes."""
     if report is None:
         return Check("recording", BUSY, "the recorder starts")
     if report.failed:

@@ -11,12 +11,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from ctypes import c_double, c_uint64
+from ctypes import c_double
 from dataclasses import dataclass, field, replace
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from multiprocessing.sharedctypes import RawValue
 from pathlib import Path as File
 from typing import Any
 
@@ -24,30 +23,19 @@ import numpy as np
 
 from estimation.errors import StillbedError
 from estimation.pose import Trajectory
-from estimation.se3 import Array
 from hardware.files.images import decode
 from hardware.files.session import FrameReader, FrameRef, Session
 from hardware.live.frame_source import COLOUR_CHANNELS, Encoded, FrameRing
 from hardware.live.prepared import Prepared
 from hardware.live.recorder_process import RecorderSender, record
-from hardware.live.records import (
-    LiveMotionReport,
-    MotionChannels,
-    OutlineOrder,
-    RecorderReport,
-    TrackingChannels,
-    TrackingReport,
-)
+from hardware.live.records import MotionChannels, SharedState, TrackingChannels
 from hardware.live.settings import VIRTUAL_ARM
-from hardware.motion.step import PoseHandover
 from hardware.offline.replay import FrameFaults
-from hardware.operator.shared_state import OperatorLink
 from hardware.process.clock import WallClock, WatchedClock
 from hardware.process.faults import Fault
-from hardware.process.system import SPAWN, Bell, SharedLatest, ask_for_real_time, blocked_sigint, set_up_process
+from hardware.process.system import SPAWN, ask_for_real_time, blocked_sigint, set_up_process
 from hardware.recording.session_reader import open_session
 from perception.frames import Frame, FrameSet, frame_set
-from planning.material import FlowShares
 
 TRANSPORT_DELAY = 0.025  # s from the middle of an exposure to the picture in the computer, as in scenarios
 REQUEST_POLL_PERIOD = 0.02  # s between checks for the tracker's request
@@ -192,7 +180,6 @@ ARM_POLL_PERIOD = 0.02  # s between checks for the virtual arm's device
 ARM_START_TIMEOUT = 60.0  # s for the device to appear, on a busy machine
 ARM_AFTERLIFE = 2.0  # s that a virtual arm continues without the run, to come to rest
 EXECUTED_STEP = 0.002  # s between rows of the executed motion
-TROUBLE_BYTES, SHARES_BYTES = 4096, 2**22  # of the text about the arm's failure; of a layer's flows: 170,000 pieces
 
 ProcessBody = Callable[..., None]
 
@@ -314,27 +301,17 @@ class RunChannels:
     """The channels between the supervising process and the others."""
 
     processes: ProcessGroup
+    shared: SharedState
     url: str  # of the arm's port
-    place: c_double  # on the path, in checkpoints; NaN before it is begun
-    tracking: SharedLatest[TrackingReport]
-    motion: SharedLatest[LiveMotionReport]
-    recorder: SharedLatest[RecorderReport]
-    orders: Connection  # to the motion process,
-    bell: Bell  # which waits for them
+    orders: Connection  # to the motion process
     lifeline: Connection  # its closing tells the tracking process that this one has ended
     arm_lifeline: Connection  # the same for a virtual arm
     sender: RecorderSender
-    link: OperatorLink
-    trouble: SharedLatest[str]  # reason why the arm cannot be used
-    start: c_double  # s, when printing began; NaN before
-    looks: c_uint64  # number of requested new searches for the surface
-    outline: SharedLatest[OutlineOrder]  # put before `looks` is increased
-    placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of the printed path, put at its start
 
     def order(self, order: object) -> None:
         """Send an order to the motion process; OSError if it has ended."""
         self.orders.send(order)
-        self.bell.ring()
+        self.shared.bell.ring()
 
     def end(self) -> None:
         """End the processes in the order of their data: motion first, then the recorder's sources, the arm last.
@@ -343,47 +320,41 @@ class RunChannels:
         """
         until = (clock := WallClock()).now() + EARLY_EXIT_TIME[0]
         self.lifeline.close()  # the motion process ends: it needs no more poses
-        printing, has_tracked = self.place.value == self.place.value, self.tracking.get() is not None
-        self.processes.end("motion", 0.0 if self.motion.get() is None else EXIT_TIMEOUT)
+        shared, printing = self.shared, not math.isnan(self.shared.place.value)
+        has_tracked = shared.tracking.get() is not None
+        self.processes.end("motion", 0.0 if shared.motion.get() is None else EXIT_TIMEOUT)
         patience = EXIT_TIMEOUT if printing else max(until - clock.now(), 0.0)
         grace = EXIT_TIMEOUT if printing else EARLY_EXIT_TIME[1]
         self.processes.end("tracking", patience if has_tracked else 0.0, grace)
         self.processes.kill("feed")  # it keeps nothing
         self.sender.close()
-        self.processes.end("recorder", 30.0 if has_tracked or self.recorder.get() is not None else 0.0)
+        self.processes.end("recorder", 30.0 if has_tracked or shared.recorder.get() is not None else 0.0)
         self.processes.end("arm", 0.1 if printing else 0.0)
 
 
 def start_processes(prepared: Prepared, folder: File, tracker: ProcessBody) -> RunChannels:
     """Start all processes, or none. folder: for a virtual arm's device. tracker: body of the tracking process."""
-    processes = ProcessGroup()
+    processes, shared = ProcessGroup(), SharedState(FrameRing([camera.size for camera in prepared.rig.cameras]))
     with ExitStack() as stack:
         stack.callback(processes.kill_all)
         url, arm_lifeline = prepared.settings.arm, SPAWN.Pipe(duplex=False)[1]
         if url == VIRTUAL_ARM:
             url = str(folder / "arm")
             arm_lifeline = start_arm(processes, prepared, File(url))
-        place, start = RawValue(c_double, math.nan), RawValue(c_double, math.nan)
-        ring, link = FrameRing([camera.size for camera in prepared.rig.cameras]), OperatorLink()
-        poses, tracking = SharedLatest[PoseHandover](), SharedLatest[TrackingReport]()
-        motion, recorder = SharedLatest[LiveMotionReport](), SharedLatest[RecorderReport]()
-        trouble, bell, shares = SharedLatest[str](TROUBLE_BYTES), Bell(), SharedLatest[FlowShares](SHARES_BYTES)
         to_recorder = [SPAWN.Pipe(duplex=False) for _ in range(3)]  # from the motion, the tracking and this process
         lifeline, notices, orders = (SPAWN.Pipe(duplex=False) for _ in range(3))
-        ends, own = [end for end, _ in to_recorder], (orders[0], bell, link.requests, trouble, to_recorder[0][1])
-        processes.start("recorder", record, (prepared.settings, ends, recorder), ends)
-        mover = MotionChannels(url, place, poses, motion, shares, *own)
-        processes.start("motion", run_motion, (prepared, mover), (orders[0], mover.recorder))
+        ends = [end for end, _ in to_recorder]
+        processes.start("recorder", record, (prepared.settings, ends, shared.recorder), ends)
+        motion = MotionChannels(shared, url, orders[0], to_recorder[0][1])
+        processes.start("motion", run_motion, (prepared, motion), (motion.orders, motion.recorder))
         if not prepared.live:
-            processes.start("feed", play, (prepared, ring, notices[1], start), (notices[1],))
-        looks, outline, placed = RawValue(c_uint64, 0), SharedLatest[OutlineOrder](), SharedLatest[Array]()
-        ends_of_tracking = to_recorder[1][1], looks, outline, placed, shares, lifeline[0]
-        track = TrackingChannels(ring, notices[0], poses, bell, tracking, motion, link, *ends_of_tracking)
-        processes.start("tracking", tracker, (prepared, track), (notices[0], track.recorder, lifeline[0]))
+            processes.start("feed", play, (prepared, shared.ring, notices[1], shared.start), (notices[1],))
+        tracking = TrackingChannels(shared, notices[0], to_recorder[1][1], lifeline[0])
+        own_ends = tracking.notices, tracking.recorder, tracking.lifeline
+        processes.start("tracking", tracker, (prepared, tracking), own_ends)
         sender = RecorderSender(to_recorder[2][1])
-        own_ends = orders[1], bell, lifeline[1], arm_lifeline, sender, link, trouble
         stack.pop_all()
-    return RunChannels(processes, url, place, tracking, motion, recorder, *own_ends, start, looks, outline, placed)
+    return RunChannels(processes, shared, url, orders[1], lifeline[1], arm_lifeline, sender)
 
 
 def start_arm(processes: ProcessGroup, prepared: Prepared, device: File) -> Connection:

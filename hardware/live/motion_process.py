@@ -67,9 +67,10 @@ class _OrderReceiver:
     """
 
     def __init__(self, channels: MotionChannels) -> None:
-        self._connection, self._requests, self._shares = channels.orders, channels.requests, channels.shares
+        shared = channels.shared
+        self._connection, self._requests, self._shares = channels.orders, shared.link.requests, shared.shares
         self._followed: FlowShares | None = None
-        self._last_stop = channels.requests.last_stop
+        self._last_stop = self._requests.last_stop
         self.orphaned, self.fingerprint = False, ""
         self._terminated = False
         signal.signal(signal.SIGTERM, self._end)
@@ -98,7 +99,7 @@ class _TickReporter:
     """Measures the latency from frames to the wire, records the bytes on the port, and reports each tick."""
 
     def __init__(self, channels: MotionChannels, sender: RecorderSender, priority: str, trace: bool) -> None:
-        self._poses, self._reports, self._sender = channels.poses, channels.reports, sender
+        self._poses, self._reports, self._sender = channels.shared.poses, channels.shared.motion, sender
         self._clock, self._priority = WallClock(), priority
         self.times = StageHistograms()
         self._events: deque[ArmEvent] = deque(maxlen=MAX_REPORTED_EVENTS)
@@ -185,10 +186,10 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
     material = material_control(prepared.task.path, prepared.task.dispensers, prepared.task.start, clock.now())
     reporter, orders = _TickReporter(channels, sender, priority, settings.trace), _OrderReceiver(channels)
     driver = open_arm(channels.url, profile, reporter.record_bytes)
-    waking, pose = _WakingClock(channels.bell), reporter.newest_pose
+    waking, pose = _WakingClock(channels.shared.bell), reporter.newest_pose
     source = RecordingSource(waking, driver, pose, orders, sender.put, profile, material, loop_settings)
     try:
-        printing = PrintLoop(source, profile, loop_settings, clock, reporter.report, channels.place)
+        printing = PrintLoop(source, profile, loop_settings, clock, reporter.report, channels.shared.place)
         reporter.motion, reporter.loop = printing.motion, printing.loop
         try:
             printing.run()
@@ -198,14 +199,14 @@ def move(prepared: Prepared, channels: MotionChannels) -> None:
             for failure in [] if material is None else material.close(clock):
                 sender.put(EventEntry(clock.now(), f"could not be switched off: {failure}", WARNING, "dispenser"))
     except StillbedError as error:  # the arm cannot be used, or nothing is recorded any more
-        channels.trouble.put(str(error))
+        channels.shared.trouble.put(str(error))
     finally:
         driver.release()
         if orders.orphaned and orders.fingerprint:
-            write_progress_durably(prepared.files.progress, orders.fingerprint, channels.place.value)
+            write_progress_durably(prepared.files.progress, orders.fingerprint, channels.shared.place.value)
         reporter.close()
         for entry in reporter.times.entries(clock.now()):
             sender.put(entry)
         sender.close()
-        if (last := channels.reports.get()) is not None:
-            channels.reports.put(replace(last, unrecorded=sender.dropped))
+        if (last := channels.shared.motion.get()) is not None:
+            channels.shared.motion.put(replace(last, unrecorded=sender.dropped))

@@ -30,7 +30,7 @@ from hardware.operator.view import NORMAL_95, HoldRow, RunResult, RunStage
 from hardware.process.clock import Histogram
 from hardware.process.system import provenance
 from planning.command import Move
-from planning.path import Path, PrintPhase, way_lengths
+from planning.path import Path, PrintPhase, ways_along
 
 _NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 MAX_REASONS, OTHER_REASONS = 40, "other reasons"  # kinds of holds that are counted apart, and the name of the rest
@@ -53,7 +53,7 @@ class RunStatistics:
 
     stages: dict[str, float] = field(default_factory=dict)  # s in each stage
     states: Counter[str] = field(default_factory=Counter)  # frame sets in each state of the tracker
-    holds: dict[str, records.HoldTotal] = field(default_factory=dict)  # by reason, its numbers left out
+    holds: dict[str, HoldRow] = field(default_factory=dict)  # by reason, its numbers left out
     extruding: float = 0.0  # s in which material left
     printing: float = 0.0  # s in which it should have left
     times: records.StageHistograms = field(default_factory=records.StageHistograms)
@@ -117,8 +117,7 @@ class RunStatistics:
     @property
     def holds_by_time(self) -> list[HoldRow]:
         """The holds by reason, the longest first."""
-        rows = (HoldRow(reason, hold.count, hold.seconds) for reason, hold in self.holds.items())
-        return sorted(rows, key=lambda row: -row.seconds)
+        return sorted(self.holds.values(), key=lambda row: -row.seconds)
 
     @property
     def duty(self) -> float:
@@ -133,7 +132,7 @@ class RunStatistics:
             return
         if reason := _NUMBER_PATTERN.sub("…", command.reason):
             hold_name = reason if reason in self.holds or len(self.holds) < MAX_REASONS else OTHER_REASONS
-            hold = self.holds.setdefault(hold_name, records.HoldTotal())
+            hold = self.holds.setdefault(hold_name, HoldRow(hold_name))
             hold.count += hold_name != self._reason
             hold.seconds += step
         self._reason = reason
@@ -185,11 +184,6 @@ class RunOutcome:
         return EXIT_SIGNAL + self.signal if self.signal else EXIT_CUT_SHORT
 
     @property
-    def inked(self) -> bool:
-        """Whether the run had a dispenser, real or simulated."""
-        return bool(self.prepared.task.dispensers) or self.prepared.settings.simulated is not None
-
-    @property
     def place(self) -> float:
         """Place up to which the path is printed, in checkpoints, earlier runs included."""
         return self.fraction if self.fraction == self.fraction else self.prepared.task.start
@@ -207,7 +201,7 @@ class RunOutcome:
     def _share(self, place: float) -> float:
         """Share of the path's length, 0 to 1, up to a place in checkpoints; 0 in a dry run."""
         path, dry = self.prepared.task.path, self.prepared.task.lift is not None
-        ways = np.concatenate([[0.0], np.cumsum(way_lengths(path.surface_from_nozzle))])
+        ways = ways_along(path.surface_from_nozzle)
         return 0.0 if dry or not ways[-1] > 0 else float(np.interp(place, np.arange(len(path)), ways) / ways[-1])
 
     @property
@@ -235,7 +229,7 @@ class RunOutcome:
             duty=statistics.duty,
             error=tails[0],
             true_error=tails[1],
-            ink=statistics.ink if self.inked else nan,
+            ink=statistics.ink if self.prepared.inked else nan,
             holds=tuple(statistics.holds_by_time[:MAX_SHOWN_HOLDS]),
             stretches=tuple(statistics.stretches.tolist()),
             record=str(files.record),
@@ -292,7 +286,7 @@ class RunOutcome:
                 "predicted_error_mm": statistics.predicted,
                 "true_error_mm": statistics.true_errors.summary,
                 "within_claim": statistics.coverage,
-                "ink_mm3": statistics.ink if self.inked else None,
+                "ink_mm3": statistics.ink if self.prepared.inked else None,
                 "printed_share": self.printed,
                 "stages_s": statistics.stages,
                 "states": statistics.states,
@@ -331,7 +325,7 @@ class RunOutcome:
                 tiles.append(tile(values, "mm", f"{name} error, 95 % / largest"))
         coverage_tile = tile(percent(coverage), "", "of the true errors within the predicted 95 % bound")
         tiles += [coverage_tile] if coverage == coverage else []
-        tiles += [tile(figure(self.statistics.ink), "mm³", "of ink")] if self.inked else []
+        tiles += [tile(figure(self.statistics.ink), "mm³", "of ink")] if self.prepared.inked else []
         tiles += [tile(percent(self.printed_before), "", "printed by earlier runs")] if task.start else []
         rows = [
             [s.name, str(s.count), *(f"{1000 * seconds:.1f}" for seconds in (s.median, s.p99, s.largest))]

@@ -101,13 +101,6 @@ class SurfacePlacement:
     verdict: str = ""  # by what it was placed, in words
 
 
-def write_placement(file: File, placement: SurfacePlacement) -> None:
-    """Write beside the file and rename: there is always one that can be read, or none."""
-    temporary = file.with_name(file.name + ".new")
-    temporary.write_text(placement_text(placement), encoding="utf-8")
-    temporary.replace(file)
-
-
 def placement_text(placement: SurfacePlacement) -> str:
     """The placement as TOML."""
     values = {
@@ -174,6 +167,11 @@ class Prepared:
         """Whether live cameras are used, rather than a recorded session shown."""
         return self.session.suffix == ".toml"
 
+    @property
+    def inked(self) -> bool:
+        """Whether the run has a dispenser, real or simulated."""
+        return bool(self.task.dispensers) or self.settings.simulated is not None
+
 
 def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fault, ...] = ()) -> Prepared:
     """A new run. InputError where a file makes no sense or the recording exists and `force` is not set.
@@ -182,8 +180,6 @@ def prepare(settings: LiveSettings, where: object, force: bool, faults: tuple[Fa
     is rendered, and before anything of an earlier run is taken away.
     """
     settings = check_settings(settings, where)
-    if settings.page:
-        page_settings(settings, where)
     assert settings.record is not None
     files = RunFiles(settings.record)
     if settings.record.exists() and not force:
@@ -212,8 +208,6 @@ def prepare_resumed(record: File, flags: dict[str, Any], faults: tuple[Fault, ..
     placement = read_placement(files.surface) if files.surface.exists() else None
     again = files.next()
     settings = check_settings(replace(settings, record=again.record), files.session)
-    if settings.page:
-        page_settings(settings, files.session)
     prepared = _prepared(settings, again, placement, faults, files.session)
     path, profile = prepared.task.path, prepared.task.profile
     start = read_progress(files.progress, path) if files.progress.exists() else 0.0
@@ -240,6 +234,8 @@ def _prepared(
     faults: tuple[Fault, ...],
     where: object,
 ) -> Prepared:
+    if settings.page:
+        page_settings(settings, where)
     notes = [f"dry run, {settings.lift:g} mm above the path"] if settings.dry_run else []
     scenario, session, virtual = settings.simulated, settings.rig, None
     _check_live_faults(settings, faults)

@@ -206,10 +206,6 @@ class RecorderReceiver:
                 memory[: len(incomplete)] = incomplete
         self._filled -= begin
 
-    def close(self) -> None:
-        """Close the pipe; the sender detects it."""
-        self._connection.close()
-
 
 def record(settings: LiveSettings, senders: Sequence[Connection], reports: SharedLatest[RecorderReport]) -> None:
     """The body of the process: record until all senders have closed their end.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from ctypes import c_double, c_uint64
-from dataclasses import dataclass
+from ctypes import c_double
+from dataclasses import dataclass, field
+from functools import partial
 from math import nan
 from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path as File
 
 import numpy as np
@@ -22,7 +24,7 @@ from hardware.live.frame_source import Encoded, FrameRing
 from hardware.live.trace import TraceBatch
 from hardware.motion.loop import CommandedPose, DispenserRecord, MaterialStatus, RecordedTick, Tick
 from hardware.motion.step import PoseHandover
-from hardware.operator.shared_state import OperatorLink, Polygons, RequestLine
+from hardware.operator.shared_state import OperatorLink, Polygons
 from hardware.process.clock import Histogram
 from hardware.process.system import Bell, SharedLatest
 from hardware.recording.loop_record import LoopRecord
@@ -35,6 +37,7 @@ from planning.placement import PathPlacement
 FRAMES_TO_WIRE_STAGE = "frames handed over to move on the wire"  # as it stands in reports and recordings
 EXPOSURE_TO_WIRE_STAGE = "exposure to move on the wire"
 LATE_TICK_STAGE = "tick late"
+TROUBLE_BYTES, SHARES_BYTES = 4096, 2**22  # of the text about the arm's failure; of a layer's flows: 170,000 pieces
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,14 +241,6 @@ Shown = SurfaceEntry | PlacedScanEntry | EventEntry | LatencyEntry | TraceBatch 
 Entry = Rig | ScanEntry | UsedEntry | SetEntry | PoseEntry | UsedPoses | Record | WireEntry | Shown
 
 
-@dataclass(slots=True)
-class HoldTotal:
-    """Holds for one reason."""
-
-    count: int = 0
-    seconds: float = 0.0
-
-
 class StageHistograms:
     """How long each stage takes, as a histogram each: a run of any length costs the same memory."""
 
@@ -268,29 +263,41 @@ class StageHistograms:
 
 
 @dataclass(frozen=True, slots=True)
-class OutlineOrder:
-    """Inside which outline of the wound the surface is to be looked for anew."""
+class SearchOrder:
+    """To look for the surface anew."""
 
-    looks: int  # of which look
-    polygons: Polygons  # none: the region is found as at first
+    looks: int  # how often that was ordered
+    outline: Polygons  # of the wound, to look inside it; none: the region is found as at first
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedState:
+    """What the processes of a run share in memory; each part has one process that writes it."""
+
+    ring: FrameRing  # frames of a session that is shown; their notices come by a pipe
+    tracking: SharedLatest[TrackingReport] = field(default_factory=SharedLatest)
+    motion: SharedLatest[LiveMotionReport] = field(default_factory=SharedLatest)
+    recorder: SharedLatest[RecorderReport] = field(default_factory=SharedLatest)
+    poses: SharedLatest[PoseHandover] = field(default_factory=SharedLatest)  # from the tracking to the motion
+    bell: Bell = field(default_factory=Bell)  # ends the motion's wait: rung once a pose or an order is there
+    # place on the path, in checkpoints, NaN before it is begun; set before a command goes to the arm
+    place: c_double = field(default_factory=partial(RawValue, c_double, nan))
+    start: c_double = field(default_factory=partial(RawValue, c_double, nan))  # s, when printing began; NaN before
+    search: SharedLatest[SearchOrder] = field(default_factory=SharedLatest)  # to the tracking
+    placed: SharedLatest[Array] = field(default_factory=SharedLatest)  # (4, 4) mm surface_from_path, once it is begun
+    # flows of the next layer, from the tracking to the motion, put before the order MATERIAL_IN
+    shares: SharedLatest[FlowShares] = field(default_factory=partial(SharedLatest, SHARES_BYTES))
+    trouble: SharedLatest[str] = field(default_factory=partial(SharedLatest, TROUBLE_BYTES))  # why the arm is no use
+    link: OperatorLink = field(default_factory=OperatorLink)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingChannels:
     """What joins the tracking process to the others."""
 
-    ring: FrameRing  # frames of a session that is shown, with their notices
-    notices: Connection
-    poses: SharedLatest[PoseHandover]  # to the motion,
-    bell: Bell  # which waits for this
-    reports: SharedLatest[TrackingReport]
-    motion: SharedLatest[LiveMotionReport]
-    link: OperatorLink
+    shared: SharedState
+    notices: Connection  # of the frames in the ring
     recorder: Connection
-    looks: c_uint64  # how often the surface is to be looked for anew
-    outline: SharedLatest[OutlineOrder]  # put before `looks` is set
-    placed: SharedLatest[Array]  # (4, 4) mm surface_from_path of what is printed, from when it is begun
-    shares: SharedLatest[FlowShares]  # of the next layer, to the motion
     lifeline: Connection  # its end says that the run is gone
 
 
@@ -298,15 +305,9 @@ class TrackingChannels:
 class MotionChannels:
     """What joins the motion process to the others."""
 
+    shared: SharedState
     url: str  # of the arm's port
-    place: c_double  # on the path, in checkpoints, NaN before it is begun; set before a command goes to the arm
-    poses: SharedLatest[PoseHandover]
-    reports: SharedLatest[LiveMotionReport]
-    shares: SharedLatest[FlowShares]  # of the next layer, put before its order MATERIAL_IN
     orders: Connection
-    bell: Bell  # rung once a pose or an order is there
-    requests: RequestLine  # of the operator's page
-    trouble: SharedLatest[str]  # why the arm cannot be used at all
     recorder: Connection
 
 

@@ -19,7 +19,6 @@ from logging import INFO, WARNING
 from multiprocessing.connection import wait
 from pathlib import Path as File
 from threading import Thread
-from types import FrameType
 
 import numpy as np
 
@@ -35,8 +34,8 @@ from hardware.live.checklist import PlacedPath, checks_table
 from hardware.live.fault_injection import FaultInjector
 from hardware.live.ipc import ProcessBody, run_tracker, start_processes
 from hardware.live.outcome import RunOutcome, RunStatistics
-from hardware.live.prepared import Prepared, SurfacePlacement, placement_text, write_placement
-from hardware.live.records import EventEntry, OutlineOrder, PlacedScanEntry, RunReports, UsedEntry
+from hardware.live.prepared import Prepared, SurfacePlacement, placement_text
+from hardware.live.records import EventEntry, PlacedScanEntry, RunReports, SearchOrder, UsedEntry
 from hardware.live.settings import page_settings, settings_text, used_files
 from hardware.live.state_machine import Orders, RunStateMachine
 from hardware.live.view import KEYS_HELP, Console, ViewBuilder, stage_line, status_line
@@ -46,7 +45,8 @@ from hardware.operator.process import OperatorPage
 from hardware.operator.shared_state import OperatorRequest, PageScene, ScanDrawing, scene_from
 from hardware.operator.view import RunResult, RunStage, Wish
 from hardware.process.clock import WallClock
-from hardware.process.system import answer_first, state_inputs
+from hardware.process.progress import write_atomically
+from hardware.process.system import answer_first, handled_signals, state_inputs
 from hardware.recording.loop_record import LOOP_ARM_ATTACHMENT, recorded_arm, recorded_begin
 from planning.material import with_offsets
 from planning.placement import PlacedBy
@@ -72,6 +72,7 @@ class LiveRun:
         self._signal = 0  # that asks the run to end
         self._stop_order_times: list[float] = []  # s, of stops whose frame is not on the wire yet
         self._stops = self._key_requests = 0  # on the wire so far; requests of the terminal, counted downwards
+        self._looks = 0  # searches for the surface that were ordered
         self._gaps = 0  # entries not recorded, when last logged
         self._turn = 0  # of the state machine, when its stage was last announced
         self._announced = -1e9  # s
@@ -90,15 +91,16 @@ class LiveRun:
             text, profile = recorded_arm(prepared.task.profile)
             prepared = self._prepared = replace(prepared, task=replace(prepared.task, profile=profile))
             channels = self._channels = start_processes(prepared, File(folder), self._tracker)
+            shared = self._shared = channels.shared
             stack.callback(channels.processes.kill_all)
             files.session.write_text(settings_text(prepared.settings), encoding="utf-8")
             for entry in (("session.toml", settings_text(prepared.settings)), (LOOP_ARM_ATTACHMENT, text)):
                 channels.sender.put(UsedEntry(*entry))
-            progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, channels.place)
+            progress_writer = ProgressWriter(files.progress, prepared.task.fingerprint, shared.place)
             stack.callback(self._close_progress, progress_writer)
             self._open_page(stack)
             address = "" if self._page is None else self._page.address
-            self._injector = FaultInjector(prepared.faults, channels.processes, files.record, channels.start, address)
+            self._injector = FaultInjector(prepared.faults, channels.processes, files.record, shared.start, address)
             for note in prepared.notes:
                 self._console.say(note)
             if prepared.settings.real_time:
@@ -116,10 +118,10 @@ class LiveRun:
         return outcome
 
     def _outcome(self) -> RunOutcome:
-        end = self._signal, self._channels.place.value, self._channels.link.pictures.get()
+        end = self._signal, self._shared.place.value, self._shared.link.pictures.get()
         return RunOutcome(self._prepared, self._machine, self._statistics, self._reports, *end)
 
-    def on_signal(self, number: int, frame: FrameType | None) -> None:
+    def on_signal(self, number: int) -> None:
         """Handle a signal that asks the run to end."""
         self._signal = number
 
@@ -127,18 +129,18 @@ class LiveRun:
         terminal = [] if self._console.file is None else [self._console.file]
         if wake in (ready := wait([wake, *self._channels.processes.sentinels(), *terminal], POLL_PERIOD)):
             wake.recv(64)
-        requests = self._requests_by_key(ready) + self._channels.link.take()
-        reports, channels, now = self._reports, self._channels, self._clock.now()
-        reports.tracking, reports.motion = channels.tracking.get(), channels.motion.get()
-        reports.recorder, reports.own_unrecorded = channels.recorder.get(), channels.sender.dropped
+        requests = self._requests_by_key(ready) + self._shared.link.take()
+        reports, shared, now = self._reports, self._shared, self._clock.now()
+        reports.tracking, reports.motion = shared.tracking.get(), shared.motion.get()
+        reports.recorder, reports.own_unrecorded = shared.recorder.get(), self._channels.sender.dropped
         self._time_stops()
         machine = self._machine
         for text in self._injector.update(now):
             self._log(f"on purpose: {text}", WARNING)
         self._send(self._check_failures(progress_writer, now) + machine(now, reports, requests))
-        if channels.looks.value != machine.looks:
-            channels.outline.put(OutlineOrder(machine.looks, machine.outline))
-            channels.looks.value = machine.looks
+        if self._looks != machine.looks:
+            self._looks = machine.looks
+            shared.search.put(SearchOrder(machine.looks, machine.outline))
         self._statistics.update(now, machine.stage, reports)
         self._statistics.add_true_error(*self._view_builder.update(reports, self._profile, self._statistics.claim))
         self._show_surface()
@@ -158,15 +160,15 @@ class LiveRun:
         if self._signal:
             return machine.end(f"ended: {SIGNAL_TEXTS[signal.Signals(self._signal)]}", now, RunStage.ENDED)
         for name in processes.dead():
-            if name == MOTION and (trouble := self._channels.trouble.get()):
+            if name == MOTION and (trouble := self._shared.trouble.get()):
                 return machine.end(trouble, now)
             if name == MOTION:
                 self._halt_arm()
-            tracking = self._channels.tracking.get()
+            tracking = self._shared.tracking.get()
             if name == TRACKING and tracking is not None and tracking.ended:
                 continue  # the state machine knows whether pictures are still needed
             if name in (MOTION, TRACKING, RECORDER):
-                recorder = self._channels.recorder.get()
+                recorder = self._shared.recorder.get()
                 detail = f": {recorder.failed}" if name == RECORDER and recorder is not None and recorder.failed else ""
                 return machine.end(f"the {name} process {processes.ending(name)}{detail}", now)
         if self._channels.sender.failed:
@@ -221,7 +223,7 @@ class LiveRun:
     def _record_begin(self, order: BeginPrint) -> BeginPrint:
         """Record the order as texts, and return it as read from them: a replay of the texts gives the same bytes."""
         if (placement := self._machine.placement) is not None:
-            self._channels.placed.put(placement.surface_from_path)
+            self._shared.placed.put(placement.surface_from_path)
         texts, order = recorded_begin(order, self._prepared.task.dispensers)
         texts["surface.toml"] = self._placement_text
         for name, text in texts.items():
@@ -246,7 +248,7 @@ class LiveRun:
     def _open_page(self, stack: ExitStack) -> None:
         if not self._prepared.settings.page:
             return
-        link = self._channels.link
+        link = self._shared.link
         self._page = OperatorPage(link, page_settings(self._prepared.settings, self._prepared.files.session))
         stack.callback(self._page.close)
         self._page.tend(self._clock.now())
@@ -267,11 +269,11 @@ class LiveRun:
         self._put_view(now)
 
     def _put_view(self, now: float, result: RunResult | None = None) -> None:
-        self._channels.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics, result))
+        self._shared.link.views.put(self._view_builder(now, self._machine, self._reports, self._statistics, result))
 
     def _show_surface(self) -> None:
         """Show path, surface and scan on the page; write the path's placement, for a run that resumes."""
-        tracking, placed_path, link = self._reports.tracking, self._machine.placed_path, self._channels.link
+        tracking, placed_path, link = self._reports.tracking, self._machine.placed_path, self._shared.link
         surface, scan = None if tracking is None else tracking.surface, link.scan.get()
         parts = placed_path, 0 if surface is None else len(surface), scan, link.laid.get()
         if any(a is not b and a != b for a, b in zip(parts, self._scene_parts, strict=True)):
@@ -279,7 +281,7 @@ class LiveRun:
             link.scene.put(replace(self._scene(surface, scan), laid=parts[3]))
         if (placement := self._placement()) is not None:
             self._placement_text = placement_text(placement)
-            write_placement(self._prepared.files.surface, placement)
+            write_atomically(self._prepared.files.surface, self._placement_text)
 
     def _scene(self, surface: Array | None, scan: ScanDrawing | None) -> PageScene:
         """The static part of the view, in the surface frame: path and scan as they are placed, and the landmarks."""
@@ -325,8 +327,8 @@ class LiveRun:
             self._log(self._reports.gaps[0], WARNING)
         if machine.turn != self._turn:
             self._turn, self._view_time = machine.turn, -1e9  # the page is told at once
-            if machine.stage is RunStage.PRINT and math.isnan(self._channels.start.value):
-                self._channels.start.value = now
+            if machine.stage is RunStage.PRINT and math.isnan(self._shared.start.value):
+                self._shared.start.value = now
             self._log(stage_line(machine.stage, machine.reason))
             if machine.stage is RunStage.FIND:
                 self._console.say(checks_table(machine.checks, sys.stdout))
@@ -358,7 +360,7 @@ class LiveRun:
         """Wait until the arm is disarmed and its queue is empty."""
         deadline = self._clock.now() + REST_TIMEOUT
         while (now := self._clock.now()) < deadline and self._channels.processes.alive(MOTION):
-            motion = self._reports.motion = self._channels.motion.get() or self._reports.motion
+            motion = self._reports.motion = self._shared.motion.get() or self._reports.motion
             self._time_stops()
             if motion is None:
                 return
@@ -368,17 +370,17 @@ class LiveRun:
             wait([wake, *self._channels.processes.sentinels()], POLL_PERIOD / 4)
 
     def _shut_down(self) -> None:
-        channels, reports = self._channels, self._reports
+        channels, shared, reports = self._channels, self._shared, self._reports
         Thread(target=importlib.import_module, args=("hardware.report.report",), daemon=True).start()  # write needs it
         self._injector.close()
         with suppress(OSError):
             channels.orders.send(Order.QUIT)
         channels.end()
-        if channels.motion.get() is None:  # ended while it loaded, perhaps between a dispenser and its first tick
+        if shared.motion.get() is None:  # ended while it loaded, perhaps between a dispenser and its first tick
             self._switch_off_material()
-        reports.tracking = channels.tracking.get() or reports.tracking
-        reports.motion = channels.motion.get() or reports.motion
-        reports.recorder, reports.own_unrecorded = channels.recorder.get(), channels.sender.dropped
+        reports.tracking = shared.tracking.get() or reports.tracking
+        reports.motion = shared.motion.get() or reports.motion
+        reports.recorder, reports.own_unrecorded = shared.recorder.get(), channels.sender.dropped
 
 
 @contextmanager
@@ -387,14 +389,11 @@ def _signal_wakeup(run: LiveRun) -> Iterator[socket.socket]:
     ours, theirs = socket.socketpair()
     for end in (ours, theirs):
         end.setblocking(False)
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    previous = [signal.signal(number, run.on_signal) for number in numbers]
     file = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     try:
-        yield ours
+        with handled_signals(run.on_signal):
+            yield ours
     finally:
         signal.set_wakeup_fd(file)
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
         ours.close()
         theirs.close()

@@ -28,8 +28,9 @@ from hardware.process import checks
 
 FROM_CAMERAS = "from the cameras"  # instead of a scan's file: they scan, and it is planned, before the run
 VIRTUAL_ARM = "virtual"  # the arm that needs no device
-MAX_LIFT_MM = 100.0  # mm of a dry run: above this the arm may leave the checked space
-MAX_PATIENCE = 600.0  # s of patience
+RANGES = {  # of numbers: lowest, highest, unit; lifted by more, the arm may leave the checked space
+    "lift": (0, 100, "mm"), "patience": (1, 600, "s"), "jpeg_quality": (0, 100, ""),
+}  # fmt: skip
 MAX_CORES = 1024
 MAX_PORT = 65535
 HOST_NAME = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9.-]{0,252}")  # of a machine
@@ -139,9 +140,7 @@ FILE_HEADER = "# A live run of stillbed: `stillbed live session.toml`. Lines tha
 
 def key_of(setting: str) -> str:
     """The "table.key" of a setting by its name."""
-    return next(
-        f"{table}.{key}" for table, keys in SETTING_KEYS.items() for key, s in keys.items() if s.name == setting
-    )
+    return str(LiveSettings.__dataclass_fields__[setting].metadata["name"])
 
 
 def read_settings(file: Path) -> LiveSettings:
@@ -195,18 +194,15 @@ def check_settings(settings: LiveSettings, where: object) -> LiveSettings:
         raise InputError(where, "arm.device", "missing", 'a device, or "virtual"')
     if s.record is None or s.record.suffix != ".mcap":
         raise InputError(where, "record.file", s.record or "missing", "a file that ends in .mcap")
-    if not 0 <= s.lift <= MAX_LIFT_MM:
-        raise InputError(where, "print.lift_mm", s.lift, f"0 to {MAX_LIFT_MM:g} mm")
+    for name, (low, high, unit) in RANGES.items():
+        if not low <= (value := getattr(s, name)) <= high:
+            raise InputError(where, key_of(name), value, checks.range_text(low, high, unit))
     if s.adapt and not s.look:
         raise InputError(where, "print.adapt", "true", "with print.look")
-    if not 1 <= s.patience <= MAX_PATIENCE:
-        raise InputError(where, "cameras.patience_s", s.patience, f"1 to {MAX_PATIENCE:g} s")
     if s.region.drawn and not s.page:
         raise InputError(
             where, "region", "no corners", "corners of two cameras or more, as no page is there to draw on"
         )
-    if not 0 <= s.jpeg_quality <= 100:
-        raise InputError(where, "record.jpeg_quality", s.jpeg_quality, "0 to 100")
     usable = available_cores()
     for key, setting in SETTING_KEYS["cores"].items():
         if not set(usable).issuperset(cores := getattr(s, setting.name)):
@@ -225,11 +221,17 @@ def _check_foxglove(port: int, where: object) -> None:
         raise InputError(where, key, port, "0, or stillbed with its extra: pip install 'stillbed[foxglove]'")
     if not 0 <= port <= MAX_PORT:
         raise InputError(where, key, port, free)
-    if port:
-        try:
-            socket.create_server((LOOPBACK, port)).close()
-        except OSError as error:
-            raise InputError(where, key, port, f"{free} ({error.strerror})") from None
+    if reason := port and _port_problem(LOOPBACK, port):
+        raise InputError(where, key, port, f"{free} ({reason})")
+
+
+def _port_problem(host: str, port: int) -> str:
+    """Why nobody can listen at an address of this machine; "" where one can."""
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        return str(error.strerror)
+    return ""
 
 
 def looks_between(settings: LiveSettings) -> int | str | None:
@@ -284,9 +286,10 @@ def named_by_flag(error: InputError, given: Collection[str]) -> InputError:
 
     given: names of the settings that flags gave.
     """
-    for name in (setting.name for keys in SETTING_KEYS.values() for setting in keys.values()):
-        if error.what == key_of(name) and (name in given or error.where == "command line"):
-            flag = FLAG_NAMES.get(name, f"--{name.replace('_', '-')}")
+    for setting in fields(LiveSettings):
+        named = error.what == setting.metadata.get("name")
+        if named and (setting.name in given or error.where == "command line"):
+            flag = FLAG_NAMES.get(setting.name, f"--{setting.name.replace('_', '-')}")
             return InputError("command line", flag, error.got, error.allowed)
     return error
 
@@ -319,7 +322,9 @@ def page_settings(settings: LiveSettings, where: object) -> OperatorSettings:
     page = OperatorSettings(s.page_address, s.page_port, certificate=s.page_certificate, key=s.page_key)
     page = replace(page, elsewhere=not address.is_loopback, names=s.page_names)
     _check_certificate(page, where)
-    _check_free(page, where)
+    if reason := _port_problem(page.host, page.port):
+        allowed = f"one that is this machine's and free ({reason})"
+        raise InputError(where, "page.address", f"{page.host} port {page.port}", allowed)
     return page
 
 
@@ -331,13 +336,3 @@ def _check_certificate(settings: OperatorSettings, where: object) -> None:
     except (OSError, ssl.SSLError):
         allowed = f"a PEM certificate with the key in {settings.key}, which has no password"
         raise InputError(where, "page.certificate", settings.certificate, allowed) from None
-
-
-def _check_free(settings: OperatorSettings, where: object) -> None:
-    """That this machine has that address, and nobody listens there."""
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    try:
-        socket.create_server((settings.host, settings.port), family=family).close()
-    except OSError as error:
-        allowed = f"one that is this machine's and free ({error.strerror})"
-        raise InputError(where, "page.address", f"{settings.host} port {settings.port}", allowed) from None

@@ -6,13 +6,11 @@ taken (`perception.mapping.dense_surface`). The scan stands in the surface frame
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +28,13 @@ from hardware.files.region_table import ANY_REGION, RegionSettings, check_region
 from hardware.live.frame_source import LiveCameraSource, SourceEnded
 from hardware.live.settings import read_settings
 from hardware.offline.track import region_search, tracker
-from hardware.operator.shared_state import DrawnRegion
+from hardware.operator.shared_state import Polygons
 from hardware.process.checks import read_toml
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, cache_folder, cached, duration_text, write_atomically
 from hardware.process.system import SharedLatest
 from hardware.report.evaluation import percent
-from hardware.report.page import document, figures_table, row_of_tiles, section, tile
+from hardware.report.page import captioned, data_url, document, figure_row, figures_table, row_of_tiles, section, tile
 from perception.frames import FrameSet, Roi, region_polygons
 from perception.lens import Lenses
 from perception.mapping.dense_surface import DenseFit, DenseSurface, ScanView, camera_place
@@ -138,16 +136,15 @@ def check_scan(order: ScanOrder) -> ScanOrder:
     return order
 
 
-def run_scan(order: ScanOrder, stream: TextIO | None = None) -> str:
+def run_scan(order: ScanOrder) -> str:
     """Scan into the order's file, with a report beside it; returns a summary. InputError, StillbedError."""
     order = check_scan(order)
     with open_source(order) as source:
-        scanned = scan_surface(source, order.sets, order.seconds, order.region, stream)
+        scanned = scan_surface(source, order.sets, order.seconds, order.region)
     write_atomically(order.out, lambda file: write_scan(
         file, scanned.scan.vertices, scanned.scan.triangles, scanned.colours, scanned.sigma
     ))  # fmt: skip
-    page = scan_page(scanned, order.source.name)
-    write_atomically(order.report, lambda file: file.write_text(page, encoding="utf-8"))
+    write_atomically(order.report, scan_page(scanned, order.source.name))
     return f"{scanned.words}\n{camera_advice(scanned)}\nscan: {order.out}\nreport: {order.report}"
 
 
@@ -205,17 +202,15 @@ def _rendered(scenario: Path, seconds: float) -> Path:
 # -- scanning
 
 
-def scan_surface(
-    source: ScanSource, sets: int, seconds: float, region: RegionSettings = ANY_REGION, stream: TextIO | None = None
-) -> SurfaceScan:
+def scan_surface(source: ScanSource, sets: int, seconds: float, region: RegionSettings = ANY_REGION) -> SurfaceScan:
     """Track the surface for `seconds`, and fuse the pictures of `sets` instants. StillbedError where it is not found.
 
     Ctrl-C while it is tracked ends that: what was seen until then is fused.
     """
     clock = WallClock()
-    selection, find = _FrameSelection(sets, seconds), region_search(source.rig, region, SharedLatest[DrawnRegion]())
+    selection, find = _FrameSelection(sets, seconds), region_search(source.rig, region, SharedLatest[Polygons]())
     with tracker(source.rig, source.roi, find=find) as step:
-        with Progress("scan", "frame sets", clock.now, stream) as progress:
+        with Progress("scan", "frame sets", clock.now) as progress:
             progress.note = "the surface is being looked for"
             progress(0, 0)
             try:
@@ -237,7 +232,7 @@ def scan_surface(
             raise StillbedError(f"{NO_SURFACE}: {selection.reason or 'no pictures came'}")
         roi, landmarks = step.roi, step.map.points
     selected = selection.selected()
-    with Progress("fuse", "%", clock.now, stream) as progress:
+    with Progress("fuse", "%", clock.now) as progress:
         progress(0, 100)
         return fuse(source.rig, roi, landmarks, selected, lambda share: progress(round(100 * share), 100))
 
@@ -345,7 +340,7 @@ TILTS_DEG, TURNS = (0.0, 20.0, 40.0, 60.0), 12  # camera places that are tried, 
 def scan_page(scanned: SurfaceScan, name: str) -> str:
     """The report as one HTML page."""
     sigma, surface, area = scanned.sigma, scanned.surface, f"{scanned.area / 100:.1f}"
-    pictures = "".join(
+    pictures = figure_row(
         _figure(title, render_scan(scanned.scan, scanned.colours, np.array(direction), VIEW_PIXELS)[..., ::-1])
         for title, direction in VIEWS
     )
@@ -363,8 +358,8 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
     tiles = (area, "cm²", "scanned"), (f"{100 * scanned.coverage:.0f}", "%", "of the region"), *sigmas
     body = [
         row_of_tiles([tile(*item) for item in tiles]),
-        section("The scan", "In plain light, from three sides.", f'<div class="pictures">{pictures}</div>'),
-        section("How well it is known", caption, f'<div class="pictures">{from_above}{scale}</div>'),
+        section("The scan", "In plain light, from three sides.", pictures),
+        section("How well it is known", caption, figure_row([from_above, scale])),
         section("Who saw it", "Share of the region that each camera shows.", figures_table(("camera", "share"), rows)),
         section("Where to put a camera", camera_advice(scanned), ""),
     ]
@@ -374,9 +369,7 @@ def scan_page(scanned: SurfaceScan, name: str) -> str:
 def _figure(title: str, image: NDArray[np.uint8]) -> str:
     from hardware.files.images import encode
 
-    data = base64.b64encode(encode(image)[1]).decode("ascii")
-    picture = f'<img alt="the scan: {title}" src="data:image/png;base64,{data}">'
-    return f"<figure>{picture}<figcaption>{title}</figcaption></figure>"
+    return captioned(f'<img alt="the scan: {title}" src="{data_url(encode(image)[1])}">', title)
 
 
 def _shaded(share: Array) -> Array:

@@ -225,10 +225,10 @@ def slowest_sets(ways: Sequence[SetWay], share: float = SLOWEST_SHARE) -> list[S
     return by_duration[: max(round(share * len(by_duration)), 1)]
 
 
-def causes(trace: RunTrace, share: float = SLOWEST_SHARE) -> list[Cause]:
-    """The causes of latency, sorted by the excess of the slowest share over all sets, largest first."""
+def causes(trace: RunTrace) -> list[Cause]:
+    """The causes of latency, sorted by the excess of the slowest sets over all sets, largest first."""
     ways = trace.ways
-    slow = {way.stamp for way in slowest_sets(ways, share)} if ways else set()
+    slow = {way.stamp for way in slowest_sets(ways)} if ways else set()
     usual, slowest = dict[str, float](), dict[str, float]()
     for way in ways:
         for name, seconds in trace.during(way.handed, way.wired).items():

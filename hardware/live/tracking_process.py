@@ -30,6 +30,7 @@ from hardware.live.records import (
     EventEntry,
     PoseEntry,
     ScanEntry,
+    SearchOrder,
     SetEntry,
     StageHistograms,
     SurfaceEntry,
@@ -42,7 +43,7 @@ from hardware.offline.looks import LiveLooks, station_places
 from hardware.offline.track import SETTLING_TIME, region_search, restore_map, tracker
 from hardware.operator.overlays import OutlineSheet, SurfaceOutline, scan_drawing, sheet_from_rois, sheet_from_sight
 from hardware.operator.process import CameraShot, Thumbnailer
-from hardware.operator.shared_state import LaidDrawing
+from hardware.operator.shared_state import LaidDrawing, Polygons
 from hardware.process.clock import WallClock, own_interval
 from hardware.process.system import (
     TRACKING_PRIORITY,
@@ -92,19 +93,19 @@ def track(prepared: Prepared, channels: TrackingChannels) -> None:
             try:
                 run()
             except (StillbedError, OSError) as error:  # reported before files are closed: the arm is stopped for it
-                channels.reports.put(replace(run.report, ended=str(error)))
+                channels.shared.tracking.put(replace(run.report, ended=str(error)))
             finally:
                 run.close()
                 for entry in run.times.entries(WallClock().now()):
                     sender.put(entry)
     except (StillbedError, OSError) as error:
-        channels.reports.put(TrackingReport(WallClock().now(), ended=str(error)))
+        channels.shared.tracking.put(TrackingReport(WallClock().now(), ended=str(error)))
     except _Terminated:
         pass
     finally:
         sender.close()
-        if (last := channels.reports.get()) is not None:
-            channels.reports.put(replace(last, unrecorded=sender.dropped))
+        if (last := channels.shared.tracking.get()) is not None:
+            channels.shared.tracking.put(replace(last, unrecorded=sender.dropped))
 
 
 class _Terminated(BaseException):
@@ -121,9 +122,10 @@ class _TrackingLoop:
     def __init__(
         self, prepared: Prepared, channels: TrackingChannels, sender: RecorderSender, stack: ExitStack
     ) -> None:
-        self._prepared, self._channels, self._sender = prepared, channels, sender
+        self._prepared, self._sender, self._lifeline = prepared, sender, channels.lifeline
+        shared = self._shared = channels.shared
         self._clock, self.times = WallClock(), StageHistograms()
-        self._commanded_head = CommandedHead(channels.motion, prepared.task.profile)
+        self._commanded_head = CommandedHead(shared.motion, prepared.task.profile)
         self._histograms_recorded = -np.inf  # s
         self._lane = TraceLane(TRACKING_LANE, self._clock, sender.put) if prepared.settings.trace else None
         self._late = 0  # `TrackingStep.late` at the last set
@@ -136,15 +138,15 @@ class _TrackingLoop:
             rig = self._source.rig
         else:
             self._session = open_session(prepared.session)
-            self._source, rig = RingSource(channels.ring, channels.notices), self._session.rig
+            self._source, rig = RingSource(shared.ring, channels.notices), self._session.rig
         stack.callback(self._source.close)
         session, placement = self._session, prepared.placement
         self._rig, self._truth = rig, None if session is None else session.truth
         self._surface = agreed_scan(prepared.scan, None if session is None else session.surface, prepared.session)
-        self._thumbnailer = Thumbnailer(channels.link.pictures, channels.link.requests)
+        self._thumbnailer = Thumbnailer(shared.link.pictures, shared.link.status)
         self.report = TrackingReport(self._clock.now(), tuple(camera.name for camera in rig.cameras))
         self._last_stamp, self._intervals = np.nan, deque[float](maxlen=INTERVAL_WINDOW)
-        channels.reports.put(self.report)
+        shared.tracking.put(self.report)
         self._earlier = None if placement is None else open_session(placement.map)
         source, region = session if self._earlier is None else self._earlier, prepared.settings.region
         rois = () if source is None else source.roi
@@ -154,23 +156,23 @@ class _TrackingLoop:
         self._scan = None if self._surface is None else read_mesh(self._surface).scan
         if self._surface is not None and self._scan is not None:
             sender.put(ScanEntry(self._surface))
-            channels.link.scan.put(scan_drawing(self._scan))
+            shared.link.scan.put(scan_drawing(self._scan))
         for roi in rois:
             sender.put(replace(roi, stamp=self.report.stamp))
         self._rois, self._region_drawn = rois, region.drawn and not rois
         self._sheet: OutlineSheet | None = None  # of this look, where a network looked
         task = prepared.task
-        adapt = channels.shares.put if prepared.settings.adapt else None
+        adapt = shared.shares.put if prepared.settings.adapt else None
         self._looks = LiveLooks(rig, task.path, stack, adapt, task.flows) if task.looks else None
         self._steps = stack.enter_context(ExitStack())
-        self._look(0)
+        self._look(SearchOrder(0, ()))
 
-    def _look(self, looks: int) -> None:
+    def _look(self, order: SearchOrder) -> None:
         """Search for the surface with a new tracker; a run that resumes gives it the earlier map.
 
         An outline by the operator is the region, without the skin beside it.
         """
-        outlined = self._outlined(looks)
+        outlined = self._outlined(order.outline)
         self._steps.close()
         self._outline = SurfaceOutline(self._rig)
         path_placement, placement, settings = None, self._prepared.placement, self._prepared.settings
@@ -179,7 +181,7 @@ class _TrackingLoop:
         starts = [-np.inf if self._earlier is None else roi.stamp + shift for roi in self._rois]
         timed = outlined or tuple(replace(roi, stamp=stamp) for roi, stamp in zip(self._rois, starts, strict=True))
         self._by_outline, self._region_recorded = bool(outlined), bool(self._rois) and not outlined
-        find = region_search(self._rig, settings.region, self._channels.link.regions, settings.model)
+        find = region_search(self._rig, settings.region, self._shared.link.regions, settings.model)
         clock, tool = self._clock.now, self._prepared.task.profile.tool
         step = tracker(self._rig, timed, self._scan, clock, tool, model=settings.model, find=find, waits=False)
         self._step = self._steps.enter_context(step)
@@ -190,18 +192,18 @@ class _TrackingLoop:
             verdict = f"as the run before placed it: {placement.verdict}" if placement.verdict else "as the run before"
             surface_from_path = new_from_old @ placement.surface_from_path
             path_placement = PathPlacement(surface_from_path, PlacedBy.EARLIER, verdict, placement.certain, True)
-        report = replace(self.report, placement=path_placement, registered=np.nan, surface=None, looks=looks)
+        report = replace(self.report, placement=path_placement, registered=np.nan, surface=None, looks=order.looks)
         self.report = replace(report, since=np.nan, outlined=False)
 
-    def _outlined(self, looks: int) -> tuple[Roi, ...]:
-        """The corrected outline for this look, if any, moved with the wound; recorded with its pictures."""
-        order, pose, sheet, self._sheet = self._channels.outline.get(), self.report.pose, self._sheet, None
-        if order is None or order.looks != looks or not order.polygons or sheet is None:
+    def _outlined(self, outline: Polygons) -> tuple[Roi, ...]:
+        """The corrected outline, if there is one, moved with the wound; recorded with its pictures."""
+        pose, sheet, self._sheet = self.report.pose, self._sheet, None
+        if not outline or sheet is None:
             return ()
-        for picture in sheet.recorded(order.polygons, self._clock.now()):
+        for picture in sheet.recorded(outline, self._clock.now()):
             self._sender.put(picture)
         measured = pose is not None and pose.state.measured
-        return sheet.rois(order.polygons, pose.base_from_surface if measured and pose is not None else None)
+        return sheet.rois(outline, pose.base_from_surface if measured and pose is not None else None)
 
     def _offer_outline(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Give the page, once a look, pictures with the wound's outline, on which the operator can correct it."""
@@ -214,20 +216,21 @@ class _TrackingLoop:
                 sheet = sheet_from_rois(self._rig, frames, step.roi)
             if sheet is not None:
                 with suppress(InputError):  # larger than their place: nothing is offered then
-                    self._channels.link.sheet.put(sheet.pictures())
+                    self._shared.link.sheet.put(sheet.pictures())
                     self._sheet = sheet
         if self._sheet is not None and pose.state.measured and (surface_map := step.map) is not None:
             self._sheet.place(surface_map.points, pose.base_from_surface)
 
     def __call__(self) -> None:
         settle_memory()
-        while not pipe_closed(self._channels.lifeline):
-            if (looks := self._channels.looks.value) != self.report.looks:
-                self._look(looks)
+        while not pipe_closed(self._lifeline):
+            order = self._shared.search.get()
+            if order is not None and order.looks != self.report.looks:
+                self._look(order)
             timed_set = self._source.take(FRAME_WAIT)
             if timed_set is None:
                 self.report = replace(self.report, stamp=self._clock.now())
-                self._channels.reports.put(self.report)
+                self._shared.tracking.put(self.report)
             else:
                 self._track(timed_set)
 
@@ -241,8 +244,8 @@ class _TrackingLoop:
         start = self._clock.now()
         pose = self._step(frames)
         sent = self._clock.now()
-        self._channels.poses.put(PoseHandover(pose, timed_set.handed, sent))
-        self._channels.bell.ring()
+        self._shared.poses.put(PoseHandover(pose, timed_set.handed, sent))
+        self._shared.bell.ring()
         self._count_times(timed_set, pose, start, sent)
         self._offer_outline(frames, pose)
         self._look_at_print(frames, pose)
@@ -268,13 +271,13 @@ class _TrackingLoop:
         """Look at the print while the nozzle waits aside."""
         if self._looks is None:
             return
-        motion, surface_map = self._channels.motion.get(), self._step.map
+        motion, surface_map = self._shared.motion.get(), self._step.map
         progress, command = (None, None) if motion is None else (motion.progress, motion.tick.command)
         landmarks = None if surface_map is None else surface_map.points
-        look = self._looks(progress, command, frames, pose, landmarks, self._channels.placed.get())
+        look = self._looks(progress, command, frames, pose, landmarks, self._shared.placed.get())
         if look is not None and self._looks.placed is not None:
             self._sender.put(look)
-            self._channels.link.laid.put(LaidDrawing(station_places(look, self._looks.placed, 2), look.laid.share))
+            self._shared.link.laid.put(LaidDrawing(station_places(look, self._looks.placed, 2), look.laid.share))
 
     def _with_head(self, frames: FrameSet) -> FrameSet:
         """The set with the print head's pose at its stamp, rounded as in a recording: a replay gets the same."""
@@ -343,7 +346,7 @@ class _TrackingLoop:
             looked=0 if self._looks is None else self._looks.count,
             look="" if self._looks is None else self._looks.text,
         )
-        self._channels.reports.put(self.report)
+        self._shared.tracking.put(self.report)
 
     def _landmarks(self, pose: SurfacePose) -> Array | None:
         """Landmarks (V, 3) for the page, taken anew now and then, as the map grows."""
@@ -365,7 +368,7 @@ class _TrackingLoop:
 
     def _show(self, frames: FrameSet, pose: SurfacePose) -> None:
         """Offer the pictures to the page, if it is open in a browser."""
-        if not self._channels.link.requests.windows:
+        if not self._shared.link.status.windows:
             return
         observations, names = self._step.last.observations, self.report.cameras
         base_from_surface = pose.base_from_surface if pose.state.measured else None

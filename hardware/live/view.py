@@ -50,7 +50,7 @@ from hardware.report.page import open_in_browser
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
 from planning.motion.retime import run_times
-from planning.path import Path, PrintPhase, way_lengths
+from planning.path import Path, PrintPhase, ways_along
 from planning.placement import tangent_of
 
 MAX_COMMANDS_KEPT = 64  # a second of them
@@ -138,8 +138,8 @@ class ViewBuilder:
         self._true_error = NozzleErrorEstimate(path)
         times = run_times(path, profile.arm, profile.limits, profile.tick)  # 36,000 checkpoints take 1.5 s
         self._remaining_times = times[-1] - times
-        lengths = way_lengths(path.surface_from_nozzle)
-        self._path_shares = np.concatenate([[0.0], np.cumsum(lengths)]) / max(float(lengths.sum()), 1e-9)
+        ways = ways_along(path.surface_from_nozzle)
+        self._path_shares = ways / max(float(ways[-1]), 1e-9)
 
     def update(self, reports: RunReports, profile: ArmProfile | None, claim: float) -> tuple[float, float]:
         """Take the newest reports; returns the true error at the nozzle and its claim, mm; NaN where none is new.
@@ -200,9 +200,8 @@ class ViewBuilder:
             return None
         points = None if tracking is None else tracking.surface
         tangent = None if points is None else tangent_of(placement, self.prepared.task.path, points)
-        sigmas = placement.sigma, placement.turn_sigma
         validity = placement.certain, machine.moves > 0, machine.confirmable
-        return PlacementView(placement.by.value, placement.verdict, *validity, tangent, *sigmas)
+        return PlacementView(placement.by.value, placement.verdict, *validity, tangent)
 
     def _motion(
         self,
@@ -276,7 +275,7 @@ class ViewBuilder:
         layers = np.unique(path.layer)
         layer = int(np.searchsorted(layers, path.layer[min(checkpoint + 1, len(path) - 1)])) + 1
         share = float(np.interp(fraction, np.arange(len(path)), self._path_shares))
-        ink = statistics.ink if task.dispensers or self.prepared.settings.simulated is not None else nan
+        ink = statistics.ink if self.prepared.inked else nan
         time_left, spread = self._time_left(planned)
         place = fraction, len(path) - 1, share, time_left, spread
         return ProgressView(*place, statistics.duty, layer, len(layers), ink, task.start)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hardware.files.pose_file import PoseWriter
     from hardware.files.region_table import RegionSettings
     from hardware.files.session import Session
-    from hardware.operator.shared_state import DrawnRegion
+    from hardware.operator.shared_state import Polygons
     from hardware.process.system import SharedLatest
     from perception.frames import FrameSet, Roi
     from perception.tracking.step import StepReport, TrackingStep
@@ -147,7 +147,7 @@ DRAW_TEXT = "draw on the page where the surface is"
 
 
 def region_search(
-    rig: Rig, region: RegionSettings, drawn: SharedLatest[DrawnRegion], model: Path | None = None
+    rig: Rig, region: RegionSettings, drawn: SharedLatest[Polygons], model: Path | None = None
 ) -> Callable[[Executor], FindRegion] | None:
     """What finds a region that is not known before the first picture, to be given one thread; None: nobody asks."""
     from hardware.files.region_table import RegionBy  # loads numpy
@@ -159,14 +159,14 @@ def region_search(
     return partial(network_search, rig, model) if region.by is RegionBy.NETWORK else None
 
 
-def _drawn_region(rig: Rig, drawn: SharedLatest[DrawnRegion], frames: FrameSet) -> Sequence[Roi] | str:
+def _drawn_region(rig: Rig, drawn: SharedLatest[Polygons], frames: FrameSet) -> Sequence[Roi] | str:
     """The region that somebody has drawn on the page; InputError where it is of other cameras."""
     from hardware.files.region_table import RegionBy, RegionSettings, check_region
 
-    region = drawn.get()
-    if region is None:
+    polygons = drawn.get()
+    if polygons is None:
         return DRAW_TEXT
-    settings = RegionSettings(RegionBy.POLYGON, region.polygons)
+    settings = RegionSettings(RegionBy.POLYGON, polygons)
     check_region("the operator's page", settings, rig)
     return settings.rois(rig, frames.stamp)
 

@@ -271,7 +271,8 @@ class PictureReader:
 
 
 OPERATOR_FILES = (  # of its page
-    *("camera.js", "delaunator.js", "lens.js", "panes.js", "scene.js", "theme.js", "words.js", "page.css", "icon.svg"),
+    *("camera.js", "canvas.js", "delaunator.js", "lens.js", "panes.js", "scene.js", "theme.js", "words.js"),
+    *("page.css", "icon.svg"),
 )
 STATUS_UNREADABLE = 422  # HTTP, unprocessable content; its text says why
 

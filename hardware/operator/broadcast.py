@@ -11,7 +11,9 @@ import json
 import math
 import struct
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from math import nan
 from typing import Any
 
@@ -112,6 +114,13 @@ def pictures_bytes(pictures: PagePictures, kind: str = "live") -> bytes:
     return b"".join([_HEAD_SIZE.pack(len(head)), head, *(each.jpeg + each.near for each in pictures.pictures)])
 
 
+ENCODERS: dict[str, Callable[[Any], str | bytes]] = {  # in the order in which a window is sent them
+    "scene": scene_text,
+    "sheet": partial(pictures_bytes, kind="sheet"),
+    "pictures": pictures_bytes,
+}
+
+
 @dataclass(slots=True)
 class TimelineRow:
     """A moment of the run: the largest errors, mm, NaN of none, the limit, mm, and whether the nozzle was held."""
@@ -124,12 +133,9 @@ class TimelineRow:
 
     def add(self, other: TimelineRow) -> None:
         """Take in a later one."""
-        self.error, self.true_error = _larger(self.error, other.error), _larger(self.true_error, other.true_error)
+        self.error = float(np.fmax(self.error, other.error))
+        self.true_error = float(np.fmax(self.true_error, other.true_error))
         self.limit, self.held = other.limit, self.held or other.held
-
-
-def _larger(a: float, b: float) -> float:
-    return b if math.isnan(a) or a < b else a
 
 
 class ErrorHistory:
@@ -143,36 +149,30 @@ class ErrorHistory:
         """Add a moment, which is later than the last."""
         if self.rows and row.stamp - self.rows[-1].stamp < self.step:
             self.rows[-1].add(row)
-            return
-        self.rows.append(row)
-        if len(self.rows) <= TIMELINE_ROWS:
-            return
-        self.step *= 2
-        merged = self.rows[:1]
-        for row_before in self.rows[1:]:
-            if row_before.stamp - merged[-1].stamp < self.step:
-                merged[-1].add(row_before)
-            else:
-                merged.append(row_before)
-        self.rows = merged
+        else:
+            self.rows.append(row)
+        if len(self.rows) > TIMELINE_ROWS:
+            self.step *= 2
+            rows, self.rows = self.rows, []
+            for each in rows:
+                self.add(each)
 
 
 class Broadcast:
     """The newest of everything that the run has put out, encoded once for all windows.
 
-    view: None before the first. gone: whether the run has ended. refused: requests that were turned away.
+    view: None before the first. encoded: scene, sheet and pictures, by their names in the link, once they are there.
+    gone: whether the run has ended. refused: requests that were turned away.
     """
 
     def __init__(self, link: OperatorLink) -> None:
         self._link = link
-        self._scene: PageScene | None = None
-        self._pictures: PagePictures | None = None
-        self._sheet: PagePictures | None = None
+        self._newest: dict[str, PageScene | PagePictures | None] = dict.fromkeys(ENCODERS)
         self._view_time = nan
         self._history, self._log = ErrorHistory(), deque[LogLine](maxlen=LOG_ROWS)
         self.view: OperatorView | WavingView | RecordingView | None = None
         self.gone, self.refused = False, 0
-        self.view_text, self.scene_text, self.pictures_bytes, self.sheet_bytes = "null", "", b"", b""
+        self.view_text, self.encoded = "null", dict[str, str | bytes]()
         self.news = asyncio.Event()  # set, and replaced, when there is something new
         self.request_event = asyncio.Event()  # something was asked of the run: its answer is looked for more often
 
@@ -184,12 +184,12 @@ class Broadcast:
             self.view, self.view_text, self._view_time = view, text_of(view), now
             if isinstance(view, OperatorView):
                 self._remember(view)
-        if (scene := self._link.scene.get()) is not self._scene and scene is not None:
-            self._scene, self.scene_text, changed = scene, scene_text(scene), True
-        if watched and (sheet := self._link.sheet.get()) is not self._sheet and sheet is not None:
-            self._sheet, self.sheet_bytes, changed = sheet, pictures_bytes(sheet, "sheet"), True
-        if watched and (pictures := self._link.pictures.get()) is not self._pictures and pictures is not None:
-            self._pictures, self.pictures_bytes, changed = pictures, pictures_bytes(pictures), True
+        for name, encode in ENCODERS.items():
+            if name != "scene" and not watched:
+                continue
+            newest = getattr(self._link, name).get()
+            if newest is not self._newest[name] and newest is not None:
+                self._newest[name], self.encoded[name], changed = newest, encode(newest), True
         if changed:
             self.wake()
 
@@ -201,7 +201,8 @@ class Broadcast:
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras of the scene, none before it is known."""
-        return () if self._scene is None else self._scene.cameras
+        scene = self._newest["scene"]
+        return scene.cameras if isinstance(scene, PageScene) else ()
 
     def age(self, now: float) -> float:
         """For how long, s, the newest view has been the newest; NaN before the first."""

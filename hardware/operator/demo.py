@@ -10,11 +10,12 @@ from dataclasses import replace
 from math import nan, radians
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.pose import TrackState
 from estimation.rig import Camera, Rig, ideal_pixels
-from estimation.scans.scan import scan_from_triangles
+from estimation.scans.scan import scan_from_triangles, triangulate_lattice
 from estimation.se3 import Array
 from hardware.files.images import small_jpeg
 from hardware.operator.overlays import SHEET_QUALITY, SHEET_WIDTH, scan_drawing
@@ -93,12 +94,7 @@ def surface_height(x: Array, y: Array) -> Array:
 
 def demo_scene(surface_from_path: Array, scan: ScanDrawing) -> PageScene:
     """Cameras, path and scan where they are placed, and the surface."""
-    side = 24  # points each way
-    x, y = np.meshgrid(np.linspace(-45, 45, side), np.linspace(-32, 32, side))
-    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-    halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]
-    triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
-    surface = np.column_stack([x.ravel(), y.ravel(), surface_height(x, y).ravel()])
+    surface, triangles = _surface_mesh(24, 45.0, 32.0)
     path = demo_path()
     path = replace(path, surface_from_nozzle=surface_from_path @ path.surface_from_nozzle)
     lines = se3.transform_points(surface_from_path, scan.lines.reshape(-1, 3)).reshape(-1, 2, 3)
@@ -107,13 +103,16 @@ def demo_scene(surface_from_path: Array, scan: ScanDrawing) -> PageScene:
 
 def demo_scan() -> ScanDrawing:
     """A scan of the same surface with its wound, 2 mm deep."""
-    side = 60  # points each way
-    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-40, 40, side), np.linspace(-27, 27, side)))
-    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-    halves = [[corner, corner + 1, corner + side], [corner + 1, corner + side + 1, corner + side]]
-    triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
-    deep = 2 * np.clip(4 * (1 - np.hypot(x / WOUND_HALF_AXES[0], y / WOUND_HALF_AXES[1])), 0, 1)
-    return scan_drawing(scan_from_triangles(np.column_stack([x, y, surface_height(x, y) - deep]), triangles))
+    points, triangles = _surface_mesh(60, 40.0, 27.0)
+    points[:, 2] -= 2 * np.clip(4 * (1 - np.hypot(*(points[:, :2] / WOUND_HALF_AXES).T)), 0, 1)
+    return scan_drawing(scan_from_triangles(points, triangles))
+
+
+def _surface_mesh(side: int, half_x: float, half_y: float) -> tuple[Array, NDArray[np.int64]]:
+    """Points (side^2, 3) of the surface, mm, and triangles (T, 3) between them."""
+    x, y = (part.ravel() for part in np.meshgrid(*(np.linspace(-half, half, side) for half in (half_x, half_y))))
+    triangles = triangulate_lattice(np.ones((side, side), bool))[1]
+    return np.column_stack([x, y, surface_height(x, y)]), triangles
 
 
 def surface_at(now: float) -> Array:
@@ -212,9 +211,7 @@ class DemoRun:
     def __init__(self, fraction: float, now: float) -> None:
         self.stage, self._turn, self._since, self._then, self._fraction = RunStage.CHECK, 1, now, now, fraction
         self._path = demo_path()
-        side = np.linspace(-60, 60, 25)
-        x, y = (part.ravel() for part in np.meshgrid(side, side))
-        self._points = np.column_stack([x, y, surface_height(x, y)])
+        self._points = _surface_mesh(25, 60.0, 60.0)[0]
         self.placement, self._moved = DEMO_PLACEMENT, False
         self._answer: RequestAnswer | None = None
         self.outline: dict[str, Array] = {}  # (N, 2) px by camera, as the operator corrected it
@@ -287,7 +284,7 @@ class DemoRun:
     def _placement_view(self) -> PlacementView:
         placed, tangent = self.placement, tangent_of(self.placement, self._path, self._points)
         worth = placed.verdict, not self._moved, self._moved, True
-        return PlacementView(placed.by.value, *worth, tangent, placed.sigma, placed.turn_sigma)
+        return PlacementView(placed.by.value, *worth, tangent)
 
     def _motion(self, now: float) -> MotionView:
         moves = self.stage in (RunStage.PRINT, RunStage.APPROACH)
@@ -363,7 +360,7 @@ def _checks(age: float) -> tuple[Check, ...]:
 def run(link: OperatorLink, page: OperatorPage, clock: Clock) -> None:
     """Go on until interrupted."""
     made_up, painter = DemoRun(260.0, clock.now()), Painter(demo_rig(), np.random.default_rng(1))
-    thumbnailer, looked = Thumbnailer(link.pictures, link.requests), made_up.stage
+    thumbnailer, looked = Thumbnailer(link.pictures, link.status), made_up.stage
     scan, shown = demo_scan(), made_up.placement
     link.scene.put(demo_scene(shown.surface_from_path, scan))
     while True:
@@ -378,7 +375,7 @@ def run(link: OperatorLink, page: OperatorPage, clock: Clock) -> None:
             link.sheet.put(demo_sheet(now, painter.shots(surface_at(now)), made_up.outline))
         looked = made_up.stage
         link.views.put(made_up.step(now))
-        if link.requests.windows:
+        if link.status.windows:
             pose = surface_at(now)
             thumbnailer.offer(now, painter.shots(pose), None if made_up.stage is RunStage.CHECK else pose)
         clock.wait_until(now + DEMO_VIEW_PERIOD)

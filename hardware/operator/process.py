@@ -25,8 +25,16 @@ import numpy as np
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.operator.settings import LOOPBACK, OperatorSettings, WindowLimits, allowed_hosts, check_settings
-from hardware.operator.shared_state import CameraPicture, OperatorLink, PagePictures, RequestLine
-from hardware.process.clock import WallClock
+from hardware.operator.shared_state import (
+    CameraPicture,
+    OperatorLink,
+    PagePictures,
+    PageStatus,
+    RecordingView,
+    WavingView,
+)
+from hardware.operator.view import Wish, refusal
+from hardware.process.clock import Clock, WallClock
 from hardware.process.system import NICE_LEVEL, SPAWN, SharedLatest, ask_to_go_first, blocked_sigint, step_back
 from perception.frames import Image
 
@@ -35,6 +43,7 @@ if TYPE_CHECKING:
 
 RESTART_AFTER = 1.0  # s between two starts of a page that died
 REPORT_FETCH_TIME, REPORT_POLL_PERIOD = 1.0, 0.02  # s
+LAST_VIEW_TIME = 0.5  # s for windows to receive the last view
 EXIT_TIMEOUT = 0.5  # s for the page's process: 0.2 in which its windows show that the run is gone, and to close them
 THUMBNAIL_WIDTH = 640  # px: three side by side fill a screen
 THUMBNAIL_QUALITY = 75  # 35 kB each; the path's edges are drawn by the browser and do not suffer
@@ -64,7 +73,6 @@ class OperatorPage:
         self._listener = socket.create_server((settings.host, settings.port), family=family, backlog=32)
         self.process: BaseProcess | None = None
         self._started = float("-inf")
-        self.restarts = 0
 
     @property
     def address(self) -> str:
@@ -79,7 +87,6 @@ class OperatorPage:
         """Start the process if it does not run, at most once a second; whether it was started. now: s."""
         if (self.process is not None and self.process.is_alive()) or now - self._started < RESTART_AFTER:
             return False
-        self.restarts += self.process is not None
         self._started = now
         arguments = (self._link, self._settings, self._listener)
         self.process = SPAWN.Process(target=operator_process, args=arguments, name="operator's page", daemon=True)
@@ -89,15 +96,15 @@ class OperatorPage:
 
     def hand_out_report(self) -> None:
         """Wait until each open window has taken the report of the run that is over, for REPORT_FETCH_TIME at most."""
-        clock, requests = WallClock(), self._link.requests
+        clock, status = WallClock(), self._link.status
         until = clock.now() + REPORT_FETCH_TIME
-        while requests.reports < requests.windows and clock.now() < until:
+        while status.reports < status.windows and clock.now() < until:
             clock.wait_until(clock.now() + REPORT_POLL_PERIOD)
 
     def close(self) -> None:
         """End the process and give the port back."""
         if self.process is not None:
-            if self._link.requests.windows:  # else nobody sees that the run is gone
+            if self._link.status.windows:  # else nobody sees that the run is gone
                 self.process.terminate()
                 self.process.join(EXIT_TIMEOUT)
             self.process.kill()
@@ -153,21 +160,20 @@ class CameraShot:
 
 
 class Thumbnailer:
-    """Makes thumbnails in a thread. made: instants whose pictures were put out; dropped: those too large."""
+    """Makes thumbnails in a thread; those larger than their place are left out."""
 
-    def __init__(self, pictures: SharedLatest[PagePictures], requests: RequestLine, near: bool = True) -> None:
+    def __init__(self, pictures: SharedLatest[PagePictures], status: PageStatus, near: bool = True) -> None:
         """near: whether the part around outline and tracks is shown as well."""
-        self._pictures, self._requests, self._clock, self._near = pictures, requests, WallClock(), near
+        self._pictures, self._status, self._clock, self._near = pictures, status, WallClock(), near
         self._due = float("-inf")
         self._crops: dict[str, Crop] = {}
-        self.made = self.dropped = 0
         self._thread = ThreadPoolExecutor(1, "live pictures", step_back)
         self._job: Future[None] | None = None  # the last one
 
     def offer(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None = None) -> bool:
         """Whether the shots of one instant (s) will be shown; never waits. base_from_surface: (4, 4) mm then."""
         now, busy = self._clock.now(), self._job is not None and not self._job.done()
-        if busy or now < self._due or not self._requests.windows:
+        if busy or now < self._due or not self._status.windows:
             return False
         self._due = now + THUMBNAIL_PERIOD
         self._job = self._thread.submit(self._make, stamp, shots, base_from_surface)
@@ -180,11 +186,8 @@ class Thumbnailer:
 
     def _make(self, stamp: float, shots: Sequence[CameraShot], base_from_surface: Array | None) -> None:
         pictures = PagePictures(stamp, tuple(map(self._picture, shots)), base_from_surface)
-        try:
+        with suppress(InputError):  # larger than their place: the next ones may be smaller
             self._pictures.put(pictures)
-            self.made += 1
-        except InputError:  # larger than their place: the next ones may be smaller
-            self.dropped += 1
 
     def _picture(self, shot: CameraShot) -> CameraPicture:
         from hardware.files.images import small_jpeg  # OpenCV is for the process that has the images
@@ -194,9 +197,32 @@ class Thumbnailer:
         if crop is not None:
             self._crops[shot.camera] = crop
             x, y, width, height = crop
-            size = (FINE_CROP_WIDTH, FINE_QUALITY) if self._requests.fine else (CROP_WIDTH, THUMBNAIL_QUALITY)
+            size = (FINE_CROP_WIDTH, FINE_QUALITY) if self._status.fine else (CROP_WIDTH, THUMBNAIL_QUALITY)
             near = small_jpeg(shot.image[y : y + height, x : x + width], *size)
         return CameraPicture(shot.camera, whole, shot.outline, shot.tracks, near, crop)
+
+
+class StatusPage:
+    """The page beside a command that moves no arm; `address` is for the browser. Nothing but `close` waits for it."""
+
+    def __init__(self, clock: Clock, file: str) -> None:
+        self.clock, self.link = clock, OperatorLink()
+        self.page = OperatorPage(self.link, OperatorSettings(page=file))
+        self.thumbnailer = Thumbnailer(self.link.pictures, self.link.status, near=False)
+        self.address = self.page.address
+
+    def wishes(self, view: RecordingView | WavingView) -> list[Wish]:
+        """What windows have asked for and may ask for under this view: STOP and END; keeps the page alive."""
+        self.page.tend(self.clock.now())
+        requests = self.link.requests.take()
+        return [each.wish for each in requests if not refusal(each.wish, each.turn, view.offers, view.turn)]
+
+    def close(self) -> None:
+        """End the page, once its windows had time for the last view."""
+        if self.link.status.windows:
+            self.clock.wait_until(self.clock.now() + LAST_VIEW_TIME)
+        self.thumbnailer.close()
+        self.page.close()
 
 
 def crop_around(shot: CameraShot, present: Crop | None) -> Crop | None:

@@ -22,6 +22,7 @@ from estimation.errors import InputError
 from estimation.rig import Camera, Rig
 from hardware.files.region_table import BY_KEY, RegionBy, check_region, region_from_table
 from hardware.operator.broadcast import (
+    ENCODERS,
     Broadcast,
     RateLimiter,
     RegionMessage,
@@ -31,8 +32,8 @@ from hardware.operator.broadcast import (
     text,
 )
 from hardware.operator.settings import AccessControl, OperatorSettings, WindowLimits, response_headers
-from hardware.operator.shared_state import DrawnRegion, OperatorLink, Polygons
-from hardware.operator.view import CALMING_WISHES, RunStage, Wish, refusal
+from hardware.operator.shared_state import OperatorLink, Polygons
+from hardware.operator.view import CALMING_WISHES, CHANGED_TEXT, RunStage, Wish, refusal
 from hardware.process.clock import WallClock
 
 STATUS_PULSE = 0.25  # s: so often a window is sent how old everything is, even if nothing is new
@@ -93,49 +94,47 @@ class WindowSession:
     def _ask(self, request: RequestMessage) -> None:
         number, reason, outline = None, self._refusal(request), Polygons()
         if not reason and request.outline is not None:
-            try:
-                outline = drawn_region(request.outline, self._broadcast.cameras).polygons
-            except InputError as error:
-                reason = f"{error.what} = {error.got}, allowed {error.allowed}"
+            outline, reason = self._polygons(request.outline)
         if not reason and (number := self._link.ask(request.wish, request.turn, request.move, outline)) is None:
             reason = "the run has not yet taken what was asked before"
         self._broadcast.request_event.set()
-        self._replies.append(text(kind="asked", tag=request.tag, wish=request.wish, number=number, words=reason))
-        self._broadcast.wake()
+        self._reply(request.tag, request.wish, number, reason)
 
     def _draw(self, message: RegionMessage) -> None:
         """Hand a drawn region to the run, or say why not."""
-        reason = self._region_refusal(message)
+        reason = self._refusal(message)
         if not reason:
-            try:
-                self._link.regions.put(drawn_region(message.region, self._broadcast.cameras))
-            except InputError as error:
-                reason = f"{error.what} = {error.got}, allowed {error.allowed}"
-        self._replies.append(text(kind="asked", tag=message.tag, wish="region", number=None, words=reason))
+            polygons, reason = self._polygons(message.region)
+            if not reason:
+                self._link.regions.put(polygons)
+        self._reply(message.tag, "region", None, reason)
+
+    def _polygons(self, drawn: dict[str, Any]) -> tuple[Polygons, str]:
+        """What was drawn on the pictures, checked; or why it makes no sense."""
+        try:
+            return drawn_region(drawn, self._broadcast.cameras), ""
+        except InputError as error:
+            return (), f"{error.what} = {error.got}, allowed {error.allowed}"
+
+    def _reply(self, tag: int, wish: str, number: int | None, reason: str) -> None:
+        self._replies.append(text(kind="asked", tag=tag, wish=wish, number=number, words=reason))
         self._broadcast.wake()
 
-    def _region_refusal(self, message: RegionMessage) -> str:
-        now, view = self._clock.now(), self._broadcast.view
-        if not self._request_limiter.take(now):
-            return "that was too fast: ask again"
-        if view is None or self._broadcast.age(now) > self._limits.stale:
-            return "nothing is heard from the run"
-        if not getattr(view, "draws", False):
-            return "no region is asked for now"
-        if message.turn != view.turn:
-            return "the run has changed since this was shown: look again, then ask again"
-        return ""
-
-    def _refusal(self, request: RequestMessage) -> str:
-        """Why a request is not even handed on, "" if it is; the run decides again, by newer knowledge."""
-        if request.wish is Wish.STOP:
+    def _refusal(self, message: RequestMessage | RegionMessage) -> str:
+        """Why a message is not even handed on, "" if it is; the run decides again, by newer knowledge."""
+        wish = message.wish if isinstance(message, RequestMessage) else None
+        if wish is Wish.STOP:
             return ""
         now, view = self._clock.now(), self._broadcast.view
         if not self._request_limiter.take(now):
             return "that was too fast: ask again"
         if view is None or self._broadcast.age(now) > self._limits.stale:
-            return "" if request.wish in CALMING_WISHES else "nothing is heard from the run"
-        return refusal(request.wish, request.turn, view.offers, view.turn)
+            return "" if wish in CALMING_WISHES else "nothing is heard from the run"
+        if wish is not None:
+            return refusal(wish, message.turn, view.offers, view.turn)
+        if not getattr(view, "draws", False):
+            return "no region is asked for now"
+        return CHANGED_TEXT if message.turn != view.turn else ""
 
     async def _send(self) -> None:
         try:
@@ -144,20 +143,15 @@ class WindowSession:
             await self._close(b"nothing was shown for too long")
 
     async def _send_all(self) -> None:
-        newest, scene, pictures, sheet = self._broadcast, "", b"", b""
+        newest, shown = self._broadcast, dict[str, str | bytes]()
         await self._put(newest.history_text())
         while True:
             news = newest.news
             self._bundle, self._shown = self._bundle + 1, asyncio.Event()
-            if newest.scene_text is not scene:
-                scene = newest.scene_text
-                await self._put(scene)
-            if newest.sheet_bytes is not sheet:
-                sheet = newest.sheet_bytes
-                await self._put(sheet)
-            if newest.pictures_bytes is not pictures:
-                pictures = newest.pictures_bytes
-                await self._put(pictures)
+            for name in ENCODERS:
+                if (part := newest.encoded.get(name, "")) is not shown.get(name):
+                    shown[name] = part
+                    await self._put(part)
             while self._replies:
                 await self._put(self._replies.popleft())
             await self._put(self._status())
@@ -195,14 +189,14 @@ class WindowSession:
         await asyncio.wait_for(closing, self._limits.patience)
 
 
-def drawn_region(region: dict[str, Any], cameras: Sequence[Camera]) -> DrawnRegion:
+def drawn_region(region: dict[str, Any], cameras: Sequence[Camera]) -> Polygons:
     """The region in a window's message, checked as that of a session.toml is; InputError."""
     source = "the page"
     settings = region_from_table(source, {BY_KEY: RegionBy.POLYGON.value} | region)
     if settings.by is not RegionBy.POLYGON or not settings.polygons:
         raise InputError(source, "region", "no corners", "corners in two cameras or more")
     check_region(source, settings, Rig(tuple(cameras)))
-    return DrawnRegion(settings.polygons)
+    return settings.polygons
 
 
 class OperatorServer:
@@ -227,8 +221,8 @@ class OperatorServer:
     async def update(self, connections: Callable[[], Sequence[web.RequestHandler]]) -> None:
         """Take what the run puts out, for ever, and keep connections few. connections: all, the oldest first."""
         while True:
-            self._link.requests.windows = len(self._windows)
-            self._link.requests.fine = getattr(self.broadcast.view, "stage", None) in FINE_STAGES
+            self._link.status.windows = len(self._windows)
+            self._link.status.fine = getattr(self.broadcast.view, "stage", None) in FINE_STAGES
             self.broadcast.refused = sum(self._access.refused.values())
             self.broadcast.update(self._clock.now(), bool(self._windows))
             sockets = set(self._windows.values())
@@ -237,7 +231,6 @@ class OperatorServer:
             await self._wait(self._clock.now())
 
     async def _wait(self, now: float) -> None:
-        """Wait until it is time to look again."""
         asked = self.broadcast.request_event
         if asked.is_set():
             asked.clear()
@@ -256,7 +249,7 @@ class OperatorServer:
     def last_update(self) -> None:
         """Show the run's last view, and that it is gone."""
         self.broadcast.update(self._clock.now(), False)
-        self._link.requests.windows = 0
+        self._link.status.windows = 0
         self.broadcast.gone = True
 
     @web.middleware
@@ -284,7 +277,7 @@ class OperatorServer:
         result = getattr(self.broadcast.view, "result", None)
         if result is None or not result.report or not (file := Path(result.report)).is_file():
             raise web.HTTPNotFound
-        self._link.requests.report_taken()
+        self._link.status.reports += 1
         headers = self._headers | {"Content-Disposition": "attachment"}
         return web.Response(body=file.read_bytes(), content_type="text/html", charset="utf-8", headers=headers)
 

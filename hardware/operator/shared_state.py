@@ -9,10 +9,10 @@ picture carries only the pose of its instant.
 from __future__ import annotations
 
 import struct
-from ctypes import c_uint64
+from ctypes import Structure, c_bool, c_uint64
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from multiprocessing.sharedctypes import RawArray
+from multiprocessing.sharedctypes import RawArray, RawValue
 from typing import Any
 from zlib import crc32
 
@@ -27,7 +27,6 @@ from hardware.operator.view import (
     CameraView,
     MoveRequest,
     OperatorView,
-    RequestAnswer,
     Wish,
 )
 from hardware.process.system import SharedLatest
@@ -42,9 +41,7 @@ SHEET_CAPACITY = 1 << 22  # bytes: pictures of six cameras, 1280 px at most
 SCENE_CAPACITY = 1 << 21  # bytes: ten times what these limits allow
 _BODY = struct.Struct("=QQBddd")  # number, turn, wish, move: mm, mm, degrees
 _RECORD = struct.Struct("=QQBdddI")  # the same, and its check sum
-# last number given, last stop, records written and taken, windows, whether pictures are wanted as fine as they are, and
-# how often the report was handed out
-_LAST, _STOP, _WRITTEN, _TAKEN, _WINDOWS, _FINE, _REPORTS = range(7)
+_LAST, _STOP, _WRITTEN, _TAKEN = range(4)  # last number given, last stop, records written and taken
 _WISHES = tuple(Wish)
 
 Polygons = tuple[tuple[str, Corners], ...]  # px, by camera's name
@@ -65,7 +62,7 @@ class RequestLine:
     """The line of requests in shared memory: one page asks, one run takes."""
 
     def __init__(self) -> None:
-        self._counts: Any = RawArray(c_uint64, 7)  # each is written whole, or not at all
+        self._counts: Any = RawArray(c_uint64, 4)  # each is written whole, or not at all
         self._records: Any = RawArray("B", REQUEST_SLOTS * _RECORD.size)
         self._stops_seen = 0
 
@@ -108,33 +105,6 @@ class RequestLine:
         """Number of the last stop, 0 before the first; any process that holds the line may watch it."""
         return int(self._counts[_STOP])
 
-    @property
-    def windows(self) -> int:
-        """How many windows show the page; without any, no pictures need be made."""
-        return int(self._counts[_WINDOWS])
-
-    @windows.setter
-    def windows(self, count: int) -> None:
-        self._counts[_WINDOWS] = count
-
-    @property
-    def fine(self) -> bool:
-        """Whether near pictures are wanted pixel by pixel, as something is judged by them."""
-        return bool(self._counts[_FINE])
-
-    @fine.setter
-    def fine(self, wanted: bool) -> None:
-        self._counts[_FINE] = wanted
-
-    @property
-    def reports(self) -> int:
-        """How often the report of a run that is over was handed out."""
-        return int(self._counts[_REPORTS])
-
-    def report_taken(self) -> None:
-        """Count a report that is handed out."""
-        self._counts[_REPORTS] += 1
-
     def _waiting(self) -> list[OperatorRequest]:
         taken, written, requests = self._counts[_TAKEN], self._counts[_WRITTEN], []
         while taken < written:
@@ -158,6 +128,17 @@ def _check_sum(*body: float) -> int:
     return crc32(_BODY.pack(*body))
 
 
+class PageStatus(Structure):
+    """What the page's process says of itself; each figure is written whole, or not at all.
+
+    windows: how many show the page; without any, no pictures need be made.
+    fine: whether near pictures are wanted pixel by pixel, as something is judged by them.
+    reports: how often the report of a run that is over was handed out.
+    """
+
+    _fields_ = (("windows", c_uint64), ("fine", c_bool), ("reports", c_uint64))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPicture:
     """One camera's picture; all pixels count in the camera's own size."""
@@ -177,13 +158,6 @@ class PagePictures:
     stamp: float  # s
     pictures: tuple[CameraPicture, ...]
     base_from_surface: Array | None = None  # (4, 4) mm at that instant, None while it is unknown
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnRegion:
-    """Where the surface is, as somebody drew it over the pictures; checked by the page against the scene's cameras."""
-
-    polygons: Polygons
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +276,6 @@ class RecordingView:
     cameras: tuple[CameraView, ...] = ()
     words: str = ""  # what ended it
     offers: tuple[Wish, ...] = ()
-    answer: RequestAnswer | None = None
     draws: bool = False  # whether a region may be drawn now
 
 
@@ -341,15 +314,15 @@ class WavingView:
     looked: int = 0  # frame sets looked at
     words: tuple[str, ...] = ()  # the result
     offers: tuple[Wish, ...] = ()
-    answer: RequestAnswer | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OperatorLink:
     """All that joins a run and its page, handed to each process that takes part when it is started.
 
-    Of `views`, `pictures`, `sheet` and `scene` each has one process that puts; the page gets. It puts `regions` and
-    `outlines`. `sheet`: the pictures in which the wound was looked for, each whole and with the outline found there.
+    Of `views`, `pictures`, `sheet` and `scene` each has one process that puts; the page gets. It puts `regions`,
+    `outlines` and `status`. `sheet`: the pictures in which the wound was looked for, each whole and with the outline
+    found there.
     """
 
     views: SharedLatest[OperatorView | WavingView | RecordingView] = field(default_factory=SharedLatest)
@@ -359,7 +332,8 @@ class OperatorLink:
     scan: SharedLatest[ScanDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
     laid: SharedLatest[LaidDrawing] = field(default_factory=lambda: SharedLatest(SCENE_CAPACITY))  # for the scene
     requests: RequestLine = field(default_factory=RequestLine)
-    regions: SharedLatest[DrawnRegion] = field(default_factory=SharedLatest)  # from the page
+    status: PageStatus = field(default_factory=lambda: RawValue(PageStatus))
+    regions: SharedLatest[Polygons] = field(default_factory=SharedLatest)  # checked against the scene's cameras
     outlines: SharedLatest[CorrectedOutline] = field(default_factory=lambda: SharedLatest(OUTLINE_CAPACITY))
 
     def ask(self, wish: Wish, turn: int, move: MoveRequest | None = None, outline: Polygons = ()) -> int | None:

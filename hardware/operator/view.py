@@ -104,6 +104,7 @@ STAGE_QUESTIONS = {
     RunStage.ENDED: "The run was finished early; the rest can be resumed",
     RunStage.FAILED: "The run cannot go on; the rest can be resumed",
 }
+CHANGED_TEXT = "the run has changed since this was shown: look again, then ask again"
 DRAW_QUESTION = "Mark the corners of the region to track, in two or more pictures"
 
 
@@ -116,7 +117,7 @@ def refusal(wish: Wish, turn: int, offers: Collection[Wish], present: int) -> st
     if wish is Wish.STOP:
         return ""
     if wish not in CALMING_WISHES and turn != present:
-        return "the run has changed since this was shown: look again, then ask again"
+        return CHANGED_TEXT
     return "" if wish in offers else f"{WISH_WORDS[wish]} cannot be done at this stage"
 
 
@@ -300,8 +301,6 @@ class PlacementView:
     moved: bool  # whether the operator has moved it
     confirmable: bool  # whether it may be confirmed as it lies
     surface_from_tangent: Array | None  # (4, 4) mm, in which a move is meant; None where the surface is not mapped
-    sigma: float = nan  # mm, of the path's middle
-    turn_sigma: float = nan  # rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,13 +323,13 @@ class LogLine:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class HoldRow:
     """The holds for one reason."""
 
     reason: str
-    count: int
-    seconds: float
+    count: int = 0
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

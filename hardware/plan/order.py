@@ -362,7 +362,7 @@ def subject_of(request: PlanRequest, flat: bool, progress: ProgressReport = no_p
     if sum(source is not None for source in sources) > 1:
         raise InputError(COMMAND_LINE, "--outline, --clicks, --wound", "more than one", "one that says where it is")
     drawn = None if request.outline is None else read_contour(request.outline)
-    clicks = None if request.clicks is None else parse_clicks(request.clicks, "--clicks")
+    clicks = None if request.clicks is None else parse_clicks(request.clicks)
     raw = read_raw_mesh(request.scan)
     progress(1, SCAN_STEPS)
     vertices = in_mm(raw.vertices, raw.triangles, request.unit, request.scan)

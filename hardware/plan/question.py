@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from estimation.errors import InputError
 from estimation.scans.scan import Scan
 from estimation.se3 import Array
 from hardware.report.evaluation import percent
-from hardware.report.page import document, section
+from hardware.report.page import data_url, document, section
 from planning.layers.grid import HeightMap, axes_along, height_map
 from planning.layers.outline import ScanColour, WoundPlace, WoundQuestionError, points_on
 from planning.layers.repair import mean_normal
@@ -80,16 +79,18 @@ def scan_colour(scan: Scan, points: Array, colours: Colours | None, where: objec
     return ScanColour(points_on(above, above.grid.nodes[known]), mask[known].astype(float))
 
 
-def parse_clicks(text: str, what: str) -> Array:
+def parse_clicks(text: str) -> Array:
     """Points (N, 3) mm of a text X,Y,Z/X,Y,Z/X,Y,Z with three places or more."""
     try:
         points = np.array([[float(word) for word in place.split(",")] for place in text.split("/")])
     except ValueError:
         points = np.empty((0, 0))
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
-        raise InputError("command line", what, text, "X,Y,Z/X,Y,Z/X,Y,Z: three places or more on the wound's rim, mm")
+        raise InputError(
+            "command line", "--clicks", text, "X,Y,Z/X,Y,Z/X,Y,Z: three places or more on the wound's rim, mm"
+        )
     if np.linalg.svd(points - points.mean(axis=0))[1][1] < 1.0:
-        raise InputError("command line", what, text, "places that do not lie in one line")
+        raise InputError("command line", "--clicks", text, "places that do not lie in one line")
     return points
 
 
@@ -131,7 +132,6 @@ def _view(
         low, high = pixels(zoom).min(axis=0), pixels(zoom).max(axis=0)
         margin = ZOOM_MARGIN * float((high - low).max())
         box = (*(low - margin), *(high - low + 2 * margin))
-    picture = base64.b64encode(encode(image)[1]).decode("ascii")
     thick = max(box[2:]) / 250
     lines = ""
     for number, place in enumerate(places, 1):
@@ -142,7 +142,7 @@ def _view(
     return (
         f'<svg id="{name}" viewBox="{" ".join(f"{v:.1f}" for v in box)}" role="img" aria-label="the scan" '
         f'style="max-width:100%;max-height:70vh"><image width="{image.shape[1]}" height="{image.shape[0]}" '
-        f'href="data:image/png;base64,{picture}"/>'
+        f'href="{data_url(encode(image)[1])}"/>'
         f'<g fill="none" stroke="#d3232f" stroke-width="{thick:.2f}">{lines}</g></svg>'
     )
 

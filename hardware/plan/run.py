@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from estimation import se3
 from estimation.errors import InputError
+from estimation.rig import ideal_pixels
+from estimation.scans.scan import triangulate_lattice
 from estimation.se3 import Array
 from hardware.arm.profile import ArmProfile
 from hardware.files.arm_file import read_arm
@@ -105,7 +107,7 @@ def run_plan(request: PlanRequest) -> tuple[str, str]:
     PlanFiles(request.out).remove_companions()
     write_atomically(request.out, lambda file: write_path(file, path))
     if request.gcode is not None:
-        write_atomically(request.gcode, lambda file: file.write_text(gcode_text(plan.path), encoding="utf-8"))
+        write_atomically(request.gcode, gcode_text(plan.path))
     with _progress("measure", "layers") as progress:
         profile = ArmProfile() if request.arm is None else read_arm(request.arm)
         moments = run_times(path, profile.arm, profile.limits, profile.tick)
@@ -145,7 +147,7 @@ def _tables(
         "bumps": bump_facts(plan), "feasible": arm, "tool": tool_facts(plan),
         "surface_from_plane": plan.wound.surface_from_plane.tolist(), "provenance": provenance().table(),
     }  # fmt: skip
-    write_atomically(files.summary, lambda file: file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8"))
+    write_atomically(files.summary, json.dumps(facts, indent=1) + "\n")
     meshes = {files.scan: None if subject.repairs is None else _surface(plan.wound), files.example: subject.example}
     for file, mesh in meshes.items():
         if mesh is not None:
@@ -172,9 +174,7 @@ def _surface(wound: WoundVolume) -> tuple[Array, Index]:
     """The used scan around the wound, holes closed: vertices (V, 3) mm, scan frame, and triangles (T, 3)."""
     every = max(1, round(REPAIRED_SCAN_STEP / wound.grid.step))
     nodes = np.dstack([wound.grid.nodes, wound.bed])[::every, ::every]
-    number = np.arange(nodes.shape[0] * nodes.shape[1]).reshape(nodes.shape[:2])
-    a, b, c, d = (m.ravel() for m in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    _, triangles = triangulate_lattice(np.ones(nodes.shape[:2], bool))
     return se3.transform_points(wound.surface_from_plane, nodes.reshape(-1, 3)), triangles
 
 
@@ -196,8 +196,7 @@ def _pictures(
     repairs = [] if subject.repairs is None else subject.repairs.rows()
     findings = [*findings_rows(plan), ("reachable checkpoints", arm), ("clearance of the tool", tool_text(plan))]
     text = ReportText(subject.name, findings, repairs, request.settings.rows(), plan_notes(plan))
-    page = page_text(plan, layers, total, text, pictures, moments)
-    write_atomically(report, lambda file: file.write_text(page, encoding="utf-8"))
+    write_atomically(report, page_text(plan, layers, total, text, pictures, moments))
     return [f"{folder.name}/ ({len(pictures)} pictures)", report.name]
 
 
@@ -379,11 +378,10 @@ def _sighting(camera: Camera, mask: NDArray[np.bool_], pose: Array, outline: Arr
 
     if not mask.any():
         return WoundSighting(camera.name, float("nan"), float("nan"))
-    points_camera = se3.transform_points(se3.inverse(camera.base_from_camera) @ pose, outline)
-    pixels = points_camera[:, :2] / points_camera[:, 2:] * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
+    pixels, depth = ideal_pixels(camera, se3.transform_points(pose, outline))
     area, middle = _area_and_centroid(pixels)
     distance = np.linalg.norm(undistort(camera, centroid(mask)[None])[0] - middle)
-    scale = float(points_camera[:, 2].mean()) / float(camera.matrix[0, 0])  # mm per px
+    scale = float(depth.mean()) / float(camera.matrix[0, 0])  # mm per px
     areas = sorted([area, float(mask.sum())])
     return WoundSighting(camera.name, float(distance) * scale, areas[0] / max(areas[1], 1e-9))
 

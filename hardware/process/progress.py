@@ -206,19 +206,9 @@ class TimeLeft:
         return left / mean, (left / min(mean + off, 1.0), left / slow if slow > MIN_RATE else math.inf)
 
 
-def json_text(values: object) -> str:
-    """As JSON, for other programs."""
-    import json
-
-    return json.dumps(values, indent=2)
-
-
-STANDARD_STREAMS = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
-
-
 def fill_standard_streams() -> None:
     """Put the null device where a stream was closed, so that nothing opened later takes its number, here or below."""
-    for name, mode in STANDARD_STREAMS:
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             file = os.open(os.devnull, os.O_RDONLY if mode == "r" else os.O_WRONLY)
             os.set_inheritable(file, True)
@@ -289,11 +279,17 @@ def write_error_text(error: Exception, out: Path | None) -> str:
     return f"{out}: {reason}; {left_files_text(out)}{hint}"
 
 
-def write_atomically(file: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under another name first, then rename it: there is never half of one."""
+def write_atomically(file: Path, contents: str | Callable[[Path], object]) -> None:
+    """Write a file under another name first, then rename it: there is never half of one.
+
+    contents: its text, or a function that writes the file whose path it is given.
+    """
     part = file.with_name(file.name + ".part")
     try:
-        write(part)
+        if isinstance(contents, str):
+            part.write_text(contents, encoding="utf-8")
+        else:
+            contents(part)
         os.replace(part, file)
     finally:
         part.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ import platform
 import signal
 import struct
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -104,6 +104,18 @@ def blocked_sigint() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+
+
+@contextmanager
+def handled_signals(handle: Callable[[int], object]) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and a closed terminal call `handle` with the signal's number until the block is left."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    previous = [signal.signal(number, lambda number, frame: handle(number)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
 
 
 REAL_TIME_PRIORITY = 10  # of 1 to 99: above all ordinary work, below the kernel's own
@@ -324,14 +336,16 @@ class _Process:
     """What this process makes things of: stated once, at its start; the files are read when it is first asked for."""
 
     def __init__(self) -> None:
-        self.state((), "")
+        self.state_inputs(())
 
-    def state(self, files: Iterable[Path | None], operator: str) -> None:
+    def state_inputs(self, files: Iterable[Path | None], operator: str = "") -> None:
+        """Say of what this process makes things from now on: files, and folders by the files in them; and for whom."""
         self._files = [file for file in files if file is not None]
         self._operator, self._start_time = operator, utc_now()
         self._known: Provenance | None = None
 
     def provenance(self) -> Provenance:
+        """What makes the things that this process makes."""
         if self._known is None:
             inputs: dict[str, str] = {}
             for file in self._files:
@@ -343,16 +357,7 @@ class _Process:
 
 
 _PROCESS = _Process()
-
-
-def state_inputs(files: Iterable[Path | None], operator: str = "") -> None:
-    """Say of what this process makes things from now on: files, and folders by the files in them; and for whom."""
-    _PROCESS.state(files, operator)
-
-
-def provenance() -> Provenance:
-    """What makes the things that this process makes."""
-    return _PROCESS.provenance()
+state_inputs, provenance = _PROCESS.state_inputs, _PROCESS.provenance
 
 
 def file_hash(file: Path) -> str:

@@ -300,11 +300,18 @@ def data_url(data: bytes) -> str:
 
 def camera_pictures(pictures: Iterable[tuple[str, bytes]]) -> str:
     """Pictures side by side, each with its camera's name."""
-    figures = "".join(
-        f'<figure><img alt="{escape(name)}" src="{data_url(data)}"/><figcaption>{escape(name)}</figcaption></figure>'
-        for name, data in pictures
-    )
-    return f'<div class="pictures">{figures}</div>'
+    images = ((f'<img alt="{escape(name)}" src="{data_url(data)}"/>', name) for name, data in pictures)
+    return figure_row(captioned(image, name) for image, name in images)
+
+
+def captioned(drawing: str, caption: str) -> str:
+    """A figure of a drawing, HTML, and its caption."""
+    return f"<figure>{drawing}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def figure_row(figures: Iterable[str]) -> str:
+    """Figures side by side."""
+    return f'<div class="pictures">{"".join(figures)}</div>'
 
 
 def two_views(curves: Sequence[tuple[Array, str]]) -> str:

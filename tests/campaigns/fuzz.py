@@ -39,7 +39,7 @@ from hardware.files.path_file import read_contour, read_path, read_progress, wri
 from hardware.files.pose_file import PoseWriter, read_poses
 from hardware.files.rig_file import ImageSource, read_board, read_rig, write_board, write_rig
 from hardware.files.session import PrintHeadLog
-from hardware.live.prepared import SurfacePlacement, read_placement, write_placement
+from hardware.live.prepared import SurfacePlacement, placement_text, read_placement
 from hardware.live.settings import read_settings, settings_text
 from hardware.offline.trajectory_files import read_pose_series, write_instants
 from hardware.operator.broadcast import parse_message
@@ -184,7 +184,7 @@ def _make_progress(folder: Path) -> None:
 def _make_placement(folder: Path) -> None:
     (folder / "x.mcap").write_bytes(b"")
     placement = SurfacePlacement(folder / "x.mcap", 1.0, se3.inverse(BASE_FROM_REST), BASE_FROM_REST)
-    write_placement(folder / "x.toml", placement)
+    (folder / "x.toml").write_text(placement_text(placement))
 
 
 def _make_poses(folder: Path) -> None:

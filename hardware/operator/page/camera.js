@@ -1,5 +1,7 @@
 // One camera's live picture with what was found in it: outline, tracks, the path where it will lie, the nozzle.
+import { circle, fitted, pairs, polygon, stroke } from "./canvas.js";
 import { drawPath, Lens, product } from "./lens.js";
+import { element } from "./words.js";
 
 const OLD = 1500; // ms: they come five times a second
 const NO_HAND = { drag: null, press: () => false, click: () => false, preview: () => null, still: () => null, draw() {} }; // nothing is moved
@@ -8,10 +10,9 @@ export class CameraPane {
   // hand: takes presses, pulls and clicks in css px of the picture; see Placing and Outlining
   constructor(name, chosen, hand = NO_HAND) {
     this.name = name;
-    this.root = document.createElement("figure");
-    this.root.className = "camera";
+    this.root = element("figure", "", "camera");
     this.root.dataset.camera = name;
-    this.canvas = document.createElement("canvas");
+    this.canvas = element("canvas");
     this.canvas.tabIndex = 0;
     this.canvas.ariaLabel = `${name}, live picture`;
     this.canvas.setAttribute("role", "button"); // it makes its picture large; what is moved by pulling has keys of its own
@@ -20,10 +21,8 @@ export class CameraPane {
       event.preventDefault();
       chosen(name);
     });
-    const caption = document.createElement("figcaption");
-    this.title = document.createElement("span");
-    this.fare = document.createElement("span");
-    this.fare.className = "fare";
+    const caption = element("figcaption");
+    [this.title, this.fare] = [element("span", name), element("span", "", "fare")];
     caption.append(this.title, this.fare);
     this.root.append(this.canvas, caption);
     const place = (event) => {
@@ -50,7 +49,6 @@ export class CameraPane {
     this.corners = []; // of the region, [x, y] px
     this.drawing = this.place = null; // takes a corner while a region is drawn; where the picture lies on the canvas
     this.image = this.close = this.found = this.lens = null;
-    this.title.textContent = name;
     this.fare.hidden = true;
   }
   // pixel of the camera at a place of the canvas in css px, null beside the picture
@@ -109,12 +107,9 @@ export class CameraPane {
     this.fare.hidden = !parts.length;
   }
   draw(scene, pose, fraction, base_from_nozzle, near) {
-    const ratio = window.devicePixelRatio || 1, w = Math.round(this.canvas.clientWidth * ratio), h = Math.round(this.canvas.clientHeight * ratio);
-    if (!w || !h) return;
-    if (this.canvas.width !== w || this.canvas.height !== h) [this.canvas.width, this.canvas.height] = [w, h];
-    const g = this.canvas.getContext("2d");
-    g.setTransform(1, 0, 0, 1, 0, 0);
-    g.clearRect(0, 0, w, h);
+    const sheet = fitted(this.canvas);
+    if (!sheet) return;
+    const { g, w, h, ratio } = sheet;
     const size = this.lens ? this.lens.camera.size : this.image ? [this.image.width, this.image.height] : null;
     if (!size) return;
     const still = this.hand.still(this, near); // a picture that stands while something is put right on it
@@ -165,10 +160,7 @@ export class CameraPane {
       g.lineTo(b[0], b[1]);
     }
     g.lineCap = "round";
-    for (const [colour, width] of [["rgb(10 18 28 / .5)", 3], ["#e3bdff", 1.6]]) {
-      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-      g.stroke();
-    }
+    stroke(g, ratio, ["rgb(10 18 28 / .5)", 3], ["#e3bdff", 1.6]);
   }
   // width of the path's line: a third of a millimetre of the surface, so that neighbours stay apart
   line(middle, right, up, ratio) {
@@ -177,14 +169,9 @@ export class CameraPane {
   }
   overlay(g, on, ratio) {
     g.lineJoin = "round";
-    for (const polygon of this.found.outline) {
-      g.beginPath();
-      for (let i = 0; i + 1 < polygon.length; i += 2) g.lineTo(...on([polygon[i], polygon[i + 1]]));
-      g.closePath();
-      for (const [colour, width] of [["rgb(10 18 28 / .6)", 4], ["#ffd75e", 2]]) {
-        [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-        g.stroke();
-      }
+    for (const outline of this.found.outline) {
+      polygon(g, pairs(outline).map(on));
+      stroke(g, ratio, ["rgb(10 18 28 / .6)", 4], ["#ffd75e", 2]);
     }
     const tracks = this.found.tracks, dot = 1.5 * ratio;
     g.fillStyle = "#ffffff";
@@ -200,25 +187,16 @@ export class CameraPane {
     this.canvas.dataset.corners = this.corners.length;
     if (!this.corners.length) return;
     const at = this.corners.map(on);
-    g.beginPath();
-    for (const p of at) g.lineTo(...p);
-    g.closePath();
+    polygon(g, at);
     g.fillStyle = "rgb(255 215 94 / .18)";
     g.fill();
-    for (const [colour, width] of [["rgb(10 18 28 / .7)", 4], ["#ffd75e", 2]]) {
-      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-      g.stroke();
-    }
+    stroke(g, ratio, ["rgb(10 18 28 / .7)", 4], ["#ffd75e", 2]);
     g.fillStyle = "#ffffff";
     for (const [x, y] of at) g.fillRect(x - 3 * ratio, y - 3 * ratio, 6 * ratio, 6 * ratio);
   }
-  ring(g, [x, y], ratio) {
-    g.beginPath();
-    g.arc(x, y, 6 * ratio, 0, 2 * Math.PI);
-    for (const [colour, width] of [["rgb(10 18 28 / .7)", 4], ["#ffffff", 2]]) {
-      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-      g.stroke();
-    }
+  ring(g, place, ratio) {
+    circle(g, place, 6 * ratio);
+    stroke(g, ratio, ["rgb(10 18 28 / .7)", 4], ["#ffffff", 2]);
   }
   nozzle(g, on, pose, ratio) {
     const pixel = this.lens.from(pose), tip = on(pixel(0, 0, 0)), back = on(pixel(0, 0, 12));
@@ -232,8 +210,7 @@ export class CameraPane {
         g.lineTo(...back);
         g.stroke();
       }
-      g.beginPath();
-      g.arc(tip[0], tip[1], 0.8 * width * ratio, 0, 2 * Math.PI);
+      circle(g, tip, 0.8 * width * ratio);
       g.fill();
     }
   }

@@ -27,18 +27,18 @@ export class ErrorChart {
   add(view) {
     const motion = view.motion, rows = this.rows, last = rows[rows.length - 1];
     if (!motion || (last && last[STAMP] >= view.stamp)) return;
-    const aged = motion.error_age > 1, row = [view.stamp, aged ? null : motion.error, aged ? null : motion.true_error, ONE_DIRECTION * motion.limit, motion.activity === "holding"];
-    if (last && view.stamp - last[STAMP] < this.step) return merge(last, row);
-    rows.push(row);
-    if (rows.length <= ROWS) return;
+    const aged = motion.error_age > 1;
+    this.enter([view.stamp, aged ? null : motion.error, aged ? null : motion.true_error, ONE_DIRECTION * motion.limit, motion.activity === "holding"]);
+  }
+  enter(row) {
+    const last = this.rows[this.rows.length - 1];
+    if (last && row[STAMP] - last[STAMP] < this.step) merge(last, row);
+    else this.rows.push(row);
+    if (this.rows.length <= ROWS) return;
     this.step *= 2;
-    const kept = [rows[0]];
-    for (const each of rows.slice(1)) {
-      const end = kept[kept.length - 1];
-      if (each[STAMP] - end[STAMP] < this.step) merge(end, each);
-      else kept.push(each);
-    }
-    this.rows = kept;
+    const rows = this.rows;
+    this.rows = [];
+    for (const each of rows) this.enter(each);
   }
   choose(span) {
     [this.span, this.zoomed] = [span, null];

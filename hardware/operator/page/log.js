@@ -1,4 +1,6 @@
 // The log of the run: all that was said since it began, with a filter.
+import { element } from "./words.js";
+
 const MOST = 2000; // lines that are kept
 
 export class RunLog {
@@ -34,10 +36,8 @@ export class RunLog {
     const shown = this.lines.filter((line) => (!only || line.warning) && line.text.toLowerCase().includes(wanted));
     this.count.textContent = `${shown.length} of ${this.lines.length}`;
     this.list.replaceChildren(...shown.reverse().map((line) => {
-      const row = document.createElement("li"), time = document.createElement("time");
-      time.textContent = `${(line.stamp - this.begun).toFixed(1)} s`;
-      row.classList.toggle("warning", line.warning);
-      row.append(time, line.text);
+      const row = element("li", "", line.warning ? "warning" : "");
+      row.append(element("time", `${(line.stamp - this.begun).toFixed(1)} s`), line.text);
       return row;
     }));
   }

@@ -1,6 +1,8 @@
 // The wound's outline, put right point by point on the pictures in which it was looked for, and sent to the run as a whole.
 // Those pictures stand still; the run carries the outline to where the surface is when it takes it.
 
+import { circle, pairs, polygon, stroke } from "./canvas.js";
+
 const MOST = 64; // points of a camera
 const ENOUGH = 3, CAMERAS = 2;
 const GRAB = 24; // css px around a point
@@ -186,30 +188,20 @@ export class Outlining {
     pane.canvas.dataset.points = JSON.stringify(points);
     if (!points.length) return;
     const at = points.map(on);
-    g.beginPath();
-    for (const p of at) g.lineTo(...p);
-    g.closePath();
+    polygon(g, at);
     g.lineJoin = "round";
-    for (const [colour, width] of [["rgb(10 18 28 / .7)", 4], [COLOUR, 2]]) {
-      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-      g.stroke();
-    }
+    stroke(g, ratio, ["rgb(10 18 28 / .7)", 4], [COLOUR, 2]);
     if (pane.small) return;
-    at.forEach(([x, y], index) => {
+    at.forEach((place, index) => {
       const chosen = this.chosen && this.chosen.name === pane.name && this.chosen.index === index;
-      g.beginPath();
-      g.arc(x, y, (chosen ? 9 : 6) * ratio, 0, 2 * Math.PI);
+      circle(g, place, (chosen ? 9 : 6) * ratio);
       g.fillStyle = chosen ? COLOUR : "#ffffff";
       g.fill();
-      [g.strokeStyle, g.lineWidth] = ["rgb(10 18 28 / .85)", 2 * ratio];
-      g.stroke();
+      stroke(g, ratio, ["rgb(10 18 28 / .85)", 2]);
     });
   }
 }
 
-function pairs(flat) {
-  return Array.from({ length: flat.length / 2 }, (_, k) => [flat[2 * k], flat[2 * k + 1]]);
-}
 // a pixel inside the picture, to a tenth
 function inside(pane, pixel) {
   return pixel.map((p, k) => Math.round(10 * Math.min(Math.max(p, 0), pane.lens.camera.size[k] - 1)) / 10);

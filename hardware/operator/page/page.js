@@ -11,7 +11,7 @@ import { ResultView } from "./result.js";
 import { SceneView } from "./scene.js";
 import { Line } from "./socket.js";
 import { onTheme, themeButton } from "./theme.js";
-import { about, ACTIVITIES, DOES, duration, figure, milliseconds, OVER, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
+import { about, ACTIVITIES, DOES, duration, element, figure, heard, milliseconds, NEWS, newsOf, OVER, STAGES, TRACKING, upper, VERDICTS } from "./words.js";
 
 const LARGE = ["find", "confirm"]; // stages in which the pictures are what matters
 const AGED = 2; // s, after which an error is one of earlier
@@ -46,12 +46,8 @@ function begun(message) {
 }
 
 function view(message) {
-  state.gone = message.kind === "gone";
-  state.full = false;
-  [state.stale, state.refused] = [message.stale, message.refused];
-  state.age = message.age === null ? Infinity : message.age;
-  state.since = performance.now();
-  state.view = message.view;
+  heard(state, message);
+  state.refused = message.refused;
   if (state.view) {
     course.add(state.view);
     log.add(state.view.log);
@@ -90,12 +86,11 @@ function choose(name) {
 }
 
 function show() {
-  const seen = state.view, age = state.age + (performance.now() - state.since) / 1000;
-  const news = state.full ? "full" : state.gone ? "gone" : !line.connected ? "lost" : !seen ? "wait" : age > state.stale ? "old" : "live";
+  const seen = state.view, [news, age] = newsOf(state, line.connected);
   const over = Boolean(seen && OVER.includes(seen.stage) && seen.result);
   document.body.dataset.news = news;
   document.body.dataset.over = over ? "yes" : "no";
-  by("news").textContent = over ? "the run is over" : (state.refused ? `${state.refused} refused · ` : "") + { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
+  by("news").textContent = over ? "the run is over" : (state.refused ? `${state.refused} refused · ` : "") + NEWS[news];
   alarm(over && news !== "full" ? "live" : news, age);
   if (seen) stage(seen);
   sees();
@@ -146,7 +141,7 @@ function stage(seen) {
   announce(now.word, question, holds ? seen.motion.reason : seen.reason);
   const notes = JSON.stringify(seen.notes);
   if (by("notes").dataset.notes !== notes) by("notes").replaceChildren(...seen.notes.map((note) => {
-    const made = text("span", note.split(/[:;]/)[0]); // the rest is told to whoever points at it
+    const made = element("span", note.split(/[:;]/)[0]); // the rest is told to whoever points at it
     made.title = note;
     return made;
   }));
@@ -201,13 +196,6 @@ function held(seen) {
   return does !== null && seen.motion.activity === "holding";
 }
 
-function text(kind, words, style) {
-  const made = document.createElement(kind);
-  made.textContent = words;
-  if (style) made.className = style;
-  return made;
-}
-
 // all rows while it checks; later, while nothing is printed, those that are not good
 function checks(all) {
   const rows = state.view.stage === "check" ? all : all.filter((row) => row.verdict === "warn" || row.verdict === "fail");
@@ -217,10 +205,9 @@ function checks(all) {
   if (body.dataset.rows === wanted) return;
   body.dataset.rows = wanted;
   body.replaceChildren(...rows.map((row) => {
-    const line = document.createElement("tr"), found = text("td", row.found);
-    line.className = row.verdict;
-    if (row.remedy) found.append(text("div", row.remedy, "remedy"));
-    line.append(text("td", VERDICTS[row.verdict]), text("td", upper(row.name)), found);
+    const line = element("tr", "", row.verdict), found = element("td", row.found);
+    if (row.remedy) found.append(element("div", row.remedy, "remedy"));
+    line.append(element("td", VERDICTS[row.verdict]), element("td", upper(row.name)), found);
     return line;
   }));
 }
@@ -251,7 +238,7 @@ function tiles(seen) {
   const put = (name, value, unit, words, over, aged) => {
     const box = document.querySelector(`[data-tile=${name}]`), caused = cause && cause.tile === name;
     if (caused && cause.got !== null) [value, unit, words] = [figure(cause.got, cause.unit === "ms" ? 0 : 2), cause.unit, `${cause.words}, limit ${+cause.limit.toPrecision(3)}`];
-    box.firstElementChild.replaceChildren(value, text("small", value === "–" ? "" : unit));
+    box.firstElementChild.replaceChildren(value, element("small", value === "–" ? "" : unit));
     box.lastElementChild.textContent = words;
     box.classList.toggle("over", Boolean(over) && !aged);
     box.classList.toggle("cause", Boolean(caused));

@@ -1,7 +1,9 @@
 // Where the path lies, before it is confirmed: how that is known, and moving it by drag, handle, keys, buttons or three points.
 // A move is told in the run's own frame on the surface (surface_from_tangent: the path's middle, z outwards); the run follows
 // the surface and says where the path lies then. Until it has, the move is drawn as it would lie on a plane.
+import { circle, stroke } from "./canvas.js";
 import { inverse, moved, product } from "./lens.js";
+import { element, upper } from "./words.js";
 
 const STEPS = [0.1, 1, 5]; // mm and degrees
 const TITLES = {
@@ -29,10 +31,9 @@ export class Placing {
     this.at = {};
     const steps = root.querySelector(".steps");
     for (const step of STEPS) {
-      const made = document.createElement("button");
+      const made = element("button", step);
       made.type = "button";
       made.dataset.step = step;
-      made.textContent = step;
       made.addEventListener("click", () => {
         this.step = step;
         this.mark();
@@ -86,7 +87,7 @@ export class Placing {
     this.flush();
   }
   words(text) {
-    const shown = text ? text[0].toUpperCase() + text.slice(1) : "";
+    const shown = upper(text);
     this.root.querySelector(".verdict span").textContent = shown;
     this.root.querySelector(".verdict").title = shown;
   }
@@ -305,8 +306,7 @@ export class Placing {
     if (middle && knob && !this.points) {
       for (const [colour, width] of [["rgb(10 18 28 / .7)", 4], ["#ffffff", 1.8]]) {
         [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-        g.beginPath();
-        g.arc(middle[0], middle[1], 4 * ratio, 0, 2 * Math.PI);
+        circle(g, middle, 4 * ratio);
         g.stroke();
         g.setLineDash([5 * ratio, 5 * ratio]);
         g.beginPath();
@@ -314,8 +314,7 @@ export class Placing {
         g.lineTo(...knob);
         g.stroke();
         g.setLineDash([]);
-        g.beginPath();
-        g.arc(knob[0], knob[1], 9 * ratio, 0, 2 * Math.PI);
+        circle(g, knob, 9 * ratio);
         if (colour === "#ffffff") {
           g.fillStyle = "rgb(42 111 151 / .9)";
           g.fill();
@@ -330,11 +329,10 @@ export class Placing {
   }
   spot(g, place, number, colour, ratio) {
     if (!place) return;
-    g.beginPath();
-    g.arc(place[0], place[1], 10 * ratio, 0, 2 * Math.PI);
-    [g.fillStyle, g.strokeStyle, g.lineWidth] = [colour, "rgb(10 18 28 / .8)", 2 * ratio];
+    circle(g, place, 10 * ratio);
+    g.fillStyle = colour;
     g.fill();
-    g.stroke();
+    stroke(g, ratio, ["rgb(10 18 28 / .8)", 2]);
     g.fillStyle = "#10181f";
     g.font = `700 ${13 * ratio}px system-ui, sans-serif`;
     [g.textAlign, g.textBaseline] = ["center", "middle"];

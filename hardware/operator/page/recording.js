@@ -3,7 +3,7 @@ import { Drawing } from "./draw.js";
 import { Panes } from "./panes.js";
 import { Line } from "./socket.js";
 import { themeButton } from "./theme.js";
-import { duration, toast, upper } from "./words.js";
+import { duration, heard, newsOf, showNews, toast, upper } from "./words.js";
 
 const STAGES = {
   record: { word: "Recording", tone: "good", say: "The cameras are being recorded." },
@@ -21,24 +21,13 @@ async function hear(message) {
   else if (message.kind === "full") state.full = true;
   else if (message.kind === "asked" && message.wish === "region") drawing.asked(message);
   else if (message.kind === "asked" && message.words) toast(`${upper(message.wish)} was not followed: ${message.words}.`, true);
-  else if (message.kind === "view" || message.kind === "gone") {
-    [state.gone, state.full, state.stale] = [message.kind === "gone", false, message.stale];
-    [state.age, state.since, state.view] = [message.age === null ? Infinity : message.age, performance.now(), message.view];
-  }
+  else if (message.kind === "view" || message.kind === "gone") heard(state, message);
   show();
 }
 
 function show() {
-  const seen = state.view, age = state.age + (performance.now() - state.since) / 1000, done = seen && seen.stage !== "record";
-  const news = state.full ? "full" : state.gone ? "gone" : !line.connected ? "lost" : !seen ? "wait" : age > state.stale ? "old" : "live";
-  document.body.dataset.news = done && news !== "full" ? "live" : news;
-  by("news").textContent = done ? "over" : { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
-  const words = {
-    old: `Nothing new for ${Number.isFinite(age) ? duration(age) : "a while"}.`, lost: "No connection to the recording.",
-    gone: "The recording has ended.", full: "Too many windows show this page. Close one of them.",
-  }[news];
-  by("alarm").hidden = !words || done;
-  by("alarm").textContent = words || "";
+  const seen = state.view, [news, age] = newsOf(state, line.connected);
+  showNews(news, age, "recording", seen && seen.stage !== "record");
   drawing.show(seen, news === "live");
   if (seen) tell(seen, news);
   for (const pane of panes.values()) pane.draw(null, null, -1, null, false);

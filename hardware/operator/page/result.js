@@ -1,6 +1,7 @@
 // The end of a run: what was printed, how well, what held it, and where the files are.
+import { fitted } from "./canvas.js";
 import { colours, onTheme } from "./theme.js";
-import { duration, figure } from "./words.js";
+import { duration, element, figure } from "./words.js";
 
 const GOOD = 0.5; // of the limit: up to there a bead is drawn as good
 
@@ -36,14 +37,14 @@ export class ResultView {
       ...(result.begun ? [[`${((100 * result.begun) / result.total).toFixed(0)} %`, "", "start of this run"]] : []),
     ];
     this.root.querySelector(".sums").replaceChildren(...tiles.map(([value, unit, words]) => {
-      const box = made("div"), figures = made("b", value);
-      figures.append(made("small", unit));
-      box.append(figures, made("span", words));
+      const box = element("div"), figures = element("b", value);
+      figures.append(element("small", unit));
+      box.append(figures, element("span", words));
       return box;
     }));
     const rows = result.holds.map((hold) => {
-      const row = made("tr");
-      row.append(made("td", hold.reason), made("td", `${hold.count} ×`), made("td", `${hold.seconds.toFixed(1)} s`));
+      const row = element("tr");
+      row.append(element("td", hold.reason), element("td", `${hold.count} ×`), element("td", `${hold.seconds.toFixed(1)} s`));
       return row;
     });
     this.root.querySelector("tbody").replaceChildren(...rows);
@@ -71,11 +72,10 @@ export class ResultView {
   }
   // the path from above, each stretch in the colour of its largest error
   draw(scene) {
-    const result = this.seen && JSON.parse(this.seen), canvas = this.canvas, ratio = window.devicePixelRatio || 1;
-    const w = Math.round(canvas.clientWidth * ratio), h = Math.round(canvas.clientHeight * ratio), p = scene.path;
-    if (!result || !w || !h || p.length < 6) return;
-    [canvas.width, canvas.height] = [w, h];
-    const g = canvas.getContext("2d"), limit = this.limit || 0.5, along = [0, 1].map((k) => p.filter((_, i) => i % 3 === k));
+    const result = this.seen && JSON.parse(this.seen), canvas = this.canvas, p = scene.path;
+    const sheet = result && p.length >= 6 && fitted(canvas);
+    if (!sheet) return;
+    const { g, w, h, ratio } = sheet, limit = this.limit || 0.5, along = [0, 1].map((k) => p.filter((_, i) => i % 3 === k));
     const [low, high] = [along.map((v) => Math.min(...v)), along.map((v) => Math.max(...v))], margin = 8 * ratio;
     const scale = Math.min(...[w, h].map((size, k) => (size - 2 * margin) / Math.max(high[k] - low[k], 1)));
     const place = (i) => [w / 2 + scale * (p[3 * i] - (low[0] + high[0]) / 2), h / 2 - scale * (p[3 * i + 1] - (low[1] + high[1]) / 2)];
@@ -104,10 +104,4 @@ export class ResultView {
     this.root.querySelector("span.poor").textContent = `beyond`;
     canvas.dataset.drawn = "yes";
   }
-}
-
-function made(kind, words = "") {
-  const node = document.createElement(kind);
-  node.textContent = words;
-  return node;
 }

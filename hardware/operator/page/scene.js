@@ -1,7 +1,9 @@
 // The scene in three dimensions on a plain canvas: cheap without a graphics card, and there in every browser.
+import { circle, fitted, stroke } from "./canvas.js";
 import Delaunator from "./delaunator.js";
 import { drawPath, moved } from "./lens.js";
 import { colours, dark, onTheme } from "./theme.js";
+import { element } from "./words.js";
 
 const SIGMAS = 20; // the uncertainty is drawn so many times as large: 0.05 mm would not be seen
 const TOOL = { long: 0.55, wide: 0.06 }; // shares of what the view near the wound reaches
@@ -131,12 +133,9 @@ export class SceneView {
     };
   }
   draw(view, fraction) {
-    const ratio = window.devicePixelRatio || 1, canvas = this.canvas, w = Math.round(canvas.clientWidth * ratio), h = Math.round(canvas.clientHeight * ratio);
-    if (!w || !h) return;
-    if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
-    const g = canvas.getContext("2d");
-    g.clearRect(0, 0, w, h);
-    if (!this.scene) return;
+    const sheet = fitted(this.canvas);
+    if (!sheet || !this.scene) return;
+    const { g, w, h, ratio } = sheet;
     const pose = view && view.tracking && view.tracking.state !== "INITIALISING" ? view.tracking.base_from_surface : null;
     this.follow(pose);
     const place = this.project(w, h);
@@ -160,8 +159,7 @@ export class SceneView {
     for (const each of this.legend.querySelectorAll(".look")) each.remove();
     const found = new Map(share.map((s) => looked(s).slice(1)));
     for (const [colour, words] of found) {
-      const line = document.createElement("span"), mark = document.createElement("i");
-      line.className = "look";
+      const line = element("span", "", "look"), mark = element("i");
       mark.style.background = colour;
       line.append(mark, words);
       this.legend.append(line);
@@ -179,13 +177,9 @@ export class SceneView {
     }
   }
   // the place that is printed next, or where a run goes on
-  mark(g, [x, y], ratio) {
-    g.beginPath();
-    g.arc(x, y, 6 * ratio, 0, 2 * Math.PI);
-    for (const [colour, width] of [[colours.card, 5], [colours.ink, 2]]) {
-      [g.strokeStyle, g.lineWidth] = [colour, width * ratio];
-      g.stroke();
-    }
+  mark(g, place, ratio) {
+    circle(g, place, 6 * ratio);
+    stroke(g, ratio, [colours.card, 5], [colours.ink, 2]);
   }
   // the middle stays where it is, so that the wound is seen to move, unless it leaves
   follow(pose) {

@@ -1,8 +1,9 @@
 // The page beside a calibration: live pictures with the corners that were found, what each camera still needs, the hint.
+import { circle, fitted, pairs, stroke } from "./canvas.js";
 import { unpacked } from "./panes.js";
 import { Line } from "./socket.js";
 import { themeButton } from "./theme.js";
-import { duration, toast, upper } from "./words.js";
+import { element, heard, newsOf, showNews, toast, upper } from "./words.js";
 
 const STAGES = {
   wave: { word: "Wave", tone: "wait", say: "Wave the board slowly before the cameras." },
@@ -22,23 +23,23 @@ const boards = new Map();
 class BoardPane {
   constructor(name) {
     this.name = name;
-    this.root = made("article", "board");
+    this.root = element("article", "", "board");
     this.root.dataset.camera = name;
-    this.figure = made("figure", "camera");
-    this.canvas = made("canvas");
+    this.figure = element("figure", "", "camera");
+    this.canvas = element("canvas");
     this.figure.append(this.canvas);
-    const head = made("div", "head"), needs = made("div", "needs");
-    this.title = made("b", "", name);
-    this.found = made("span");
+    const head = element("div", "", "head"), needs = element("div", "", "needs");
+    this.title = element("b", name);
+    this.found = element("span");
     head.append(this.title, this.found);
     this.bars = Object.fromEntries(["where", "tilts", "depth"].map((key, k) => {
-      const what = made("span", "", ["all over the picture", "tilted", "near and far"][k]), bar = made("div", "bar"), far = made("b");
-      bar.append(made("i"));
+      const what = element("span", ["all over the picture", "tilted", "near and far"][k]), bar = element("div", "", "bar"), far = element("b");
+      bar.append(element("i"));
       needs.append(what, bar, far);
       return [key, { what, bar, far }];
     }));
     this.ways = TILTS.map(([sign, words]) => {
-      const way = made("i", "way", sign);
+      const way = element("i", sign, "way");
       way.title = words;
       this.bars.tilts.what.append(way);
       return way;
@@ -63,27 +64,18 @@ class BoardPane {
     this.root.dataset.next = next ? "yes" : "no";
   }
   draw() {
-    const ratio = window.devicePixelRatio || 1, w = Math.round(this.canvas.clientWidth * ratio), h = Math.round(this.canvas.clientHeight * ratio);
-    if (!w || !h || !this.image || !this.view) return;
-    if (this.canvas.width !== w || this.canvas.height !== h) [this.canvas.width, this.canvas.height] = [w, h];
-    const g = this.canvas.getContext("2d"), { image } = this;
+    const { image } = this, sheet = image && this.view && fitted(this.canvas);
+    if (!sheet) return;
+    const { g, w, h, ratio } = sheet;
     const scale = Math.min(w / image.width, h / image.height), x0 = (w - scale * image.width) / 2, y0 = (h - scale * image.height) / 2;
-    g.clearRect(0, 0, w, h);
     g.drawImage(image, x0, y0, scale * image.width, scale * image.height);
     this.parts(g, x0, y0, scale * image.width, scale * image.height, ratio);
-    const dot = 3 * ratio, shown = (scale * image.width) / this.width(); // corners are px of the camera's own size
-    for (let i = 0; i + 1 < this.tracks.length; i += 2) {
-      g.beginPath();
-      g.arc(x0 + shown * (this.tracks[i] + 0.5), y0 + shown * (this.tracks[i + 1] + 0.5), dot, 0, 2 * Math.PI);
-      for (const [colour, wide] of [["rgb(10 18 28 / .75)", 4], ["#3ddc84", 2]]) {
-        [g.strokeStyle, g.lineWidth] = [colour, wide * ratio];
-        g.stroke();
-      }
+    const shown = (scale * image.width) / this.view.size[0]; // corners are px of the camera's own size
+    for (const [x, y] of pairs(this.tracks)) {
+      circle(g, [x0 + shown * (x + 0.5), y0 + shown * (y + 0.5)], 3 * ratio);
+      stroke(g, ratio, ["rgb(10 18 28 / .75)", 4], ["#3ddc84", 2]);
     }
     this.canvas.dataset.drawn = this.tracks.length ? "corners" : "picture";
-  }
-  width() {
-    return this.view.size[0];
   }
   // what lies in the shade has not seen the board often enough
   parts(g, x0, y0, w, h, ratio) {
@@ -108,13 +100,6 @@ class BoardPane {
   }
 }
 
-function made(kind, style = "", words = "") {
-  const found = document.createElement(kind);
-  if (style) found.className = style;
-  found.textContent = words;
-  return found;
-}
-
 function fill({ bar, far }, share) {
   bar.firstElementChild.style.width = `${(100 * share).toFixed(1)}%`;
   bar.classList.toggle("full", share >= 1);
@@ -126,8 +111,7 @@ async function hear(message) {
   if (message.kind === "full") state.full = true;
   else if (message.kind === "asked" && message.words) toast(`${upper(message.wish)} was not followed: ${message.words}.`, true);
   else if (message.kind === "view" || message.kind === "gone") {
-    [state.gone, state.full, state.stale] = [message.kind === "gone", false, message.stale];
-    [state.age, state.since, state.view] = [message.age === null ? Infinity : message.age, performance.now(), message.view];
+    heard(state, message);
     show();
   }
 }
@@ -148,17 +132,9 @@ function pane(name) {
 }
 
 function show() {
-  const seen = state.view, age = state.age + (performance.now() - state.since) / 1000, done = seen && !["wave", "solve"].includes(seen.stage);
-  const quiet = seen && seen.stage !== "wave"; // nothing is told while it computes, nor once it is over
-  const news = state.full ? "full" : state.gone ? "gone" : !line.connected ? "lost" : !seen ? "wait" : age > state.stale && !quiet ? "old" : "live";
-  document.body.dataset.news = done && news !== "full" ? "live" : news;
-  by("news").textContent = done ? "over" : { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" }[news];
-  const words = {
-    old: `Nothing new for ${Number.isFinite(age) ? duration(age) : "a while"}.`, lost: "No connection to the calibration.",
-    gone: "The calibration has ended.", full: "Too many windows show this page. Close one of them.",
-  }[news];
-  by("alarm").hidden = !words || done;
-  by("alarm").textContent = words || "";
+  const seen = state.view, quiet = seen && seen.stage !== "wave"; // nothing is told while it computes, nor once it is over
+  const [news, age] = newsOf(state, line.connected, quiet);
+  showNews(news, age, "calibration", seen && !["wave", "solve"].includes(seen.stage));
   if (seen) tell(seen, news);
 }
 

@@ -60,6 +60,35 @@ export function about(seconds) {
 export function upper(words) {
   return words ? words[0].toUpperCase() + words.slice(1) : "";
 }
+/** A new element with words in it. style: its CSS class. */
+export function element(kind, words = "", style = "") {
+  const made = document.createElement(kind);
+  made.textContent = words;
+  if (style) made.className = style;
+  return made;
+}
+
+/** Takes over what a message says of the run: its newest view, how old that is, and from which age on it is too old. */
+export function heard(state, message) {
+  [state.gone, state.full, state.stale, state.view] = [message.kind === "gone", false, message.stale, message.view];
+  [state.age, state.since] = [message.age === null ? Infinity : message.age, performance.now()];
+}
+/** How old the newest view is, s, and in one word whether it counts. quiet: nothing newer is expected. */
+export function newsOf(state, connected, quiet = false) {
+  const age = state.age + (performance.now() - state.since) / 1000;
+  return [state.full ? "full" : state.gone ? "gone" : !connected ? "lost" : !state.view ? "wait" : age > state.stale && !quiet ? "old" : "live", age];
+}
+export const NEWS = { live: "live", wait: "waiting", old: "old", gone: "ended", lost: "not connected", full: "too many windows" };
+/** Shows that, on the page beside a recording or calibration (what), with an alarm where it is bad. done: it is over. */
+export function showNews(news, age, what, done) {
+  document.body.dataset.news = done && news !== "full" ? "live" : news;
+  document.getElementById("news").textContent = done ? "over" : NEWS[news];
+  const words = {
+    old: `Nothing new for ${Number.isFinite(age) ? duration(age) : "a while"}.`, lost: `No connection to the ${what}.`,
+    gone: `The ${what} has ended.`, full: "Too many windows show this page. Close one of them.",
+  }[news], box = document.getElementById("alarm");
+  [box.hidden, box.textContent] = [!words || done, words || ""];
+}
 
 /** Shows words for six seconds; refused: in the colour of a refused request. */
 export function toast(words, refused) {
