@@ -23,7 +23,6 @@ from hardware.motion.loop import Order
 from hardware.motion.step import PauseOrder
 from hardware.recording.loop_record import LoopKeeper, LoopRecord
 from hardware.recording.recorder import Recorder
-from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.scenario import read_scenario
 from planning.command import Move
 from planning.material import FlowShares
@@ -96,7 +95,7 @@ def simulated(
                     later = next(told, (float("inf"), PauseOrder.PAUSE))
 
             world.every(0.01, order)
-        world._device.faults = PortFaults(away=away)
+        world._device.away = away
         world.run()
     return file, sink
 

@@ -36,7 +36,7 @@ from hardware.process.faults import FaultKind, FaultPart, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
 from hardware.recording.loop_record import LoopKeeper, RecordingSource, drop_record
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults, VirtualDevice
+from hardware.simulator.arm.ports import VirtualDevice
 from hardware.simulator.camera_pipeline import (
     TICK_EVENT,
     CameraPipeline,
@@ -85,25 +85,6 @@ class WorldSink(PipelineSink, Protocol):
 
     def look(self, look: Look) -> None:
         """The result of a look at what was printed."""
-
-
-class _Wire:
-    """Hands the bytes at the arm's port to the sink."""
-
-    def __init__(self, sink: WorldSink, clock: Clock) -> None:
-        self._sink, self._clock = sink, clock
-
-    def from_host(self, data: bytes) -> None:
-        self._sink.wire(self._clock.now(), data, True)
-
-    def to_host(self, sent: bytes, read: bytes) -> None:
-        self._sink.wire(self._clock.now(), read, False)
-
-    def opened(self) -> None:
-        pass
-
-    def to_arm(self, data: bytes) -> None:
-        pass
 
 
 class _SimulatedOperator:
@@ -172,7 +153,7 @@ class SimulatedWorld:
         self._events = EventQueue(self._time)
         profile, faults, self._commanded_pose = scenario.profile, scenario.faults, CommandedPose(scenario.profile)
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, faults, scenario.baud)
-        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time))
+        self._device = VirtualDevice(self.arm, self._time, scenario.baud, self._put_bytes)
         self._truth_log = TruthLog(path, scenario.true_arm, truth, profile.tick, profile.lag)
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
@@ -272,7 +253,7 @@ class SimulatedWorld:
             if fault.kind is FaultKind.KILL or fault.end >= self.scenario.seconds:
                 self._killed = True
                 self.dispensers.disconnect()
-                self._device.faults = PortFaults(away=[(now, math.inf)])
+                self._device.away = [(now, math.inf)]
                 self._end = min(self._end, now + KILL_TAIL)
                 raise _MotionKilledError
             self._advance(fault.end)
@@ -325,6 +306,9 @@ class SimulatedWorld:
             self._beads.draw(self._scene, until)
 
     # -- inputs and outputs of the motion
+
+    def _put_bytes(self, data: bytes, sent: bool) -> None:
+        self._sink.wire(self._time.now(), data, sent)
 
     def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
         """Begin the print with the path in the tracker's surface frame, as soon as that frame can be measured."""

@@ -25,9 +25,10 @@ from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import Interval, PortFaults, VirtualDevice
+from hardware.simulator.arm.ports import Interval
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Command, Move, feed_for
+from tests.faulty_port import FaultyDevice, PortFaults
 
 RUN_SECONDS = 600.0  # of one run
 MAX_STALL = 0.6  # s of a stall
@@ -150,7 +151,7 @@ class LinkRun:
         self._virtual = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
         port = PortFaults(windows(rng, 30.0, MAX_STALL), windows(rng, 100.0, 5.0), 0.1, 2.0, 0.005 * (manner == LOSSY))
         self._blocked = port.blocked
-        device = VirtualDevice(self._virtual, self._clock, profile.baud, port, seed, _PortLogger(counts))
+        device = FaultyDevice(self._virtual, self._clock, profile.baud, port, seed, _PortLogger(counts))
         self._stalls = windows(rng, 30.0, MAX_STALL)  # of the host's loop
         self._arm = Arm(S6H4D(device, profile), profile, 0.0, LinkSettings(poll=POLL_INTERVAL))
         self._phase, self._last_frame, self._frames, self._stops = 0.0, -1.0, 0, 0
