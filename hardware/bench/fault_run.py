@@ -39,7 +39,7 @@ from hardware.simulator.scenario_tables import bare_scene
 from hardware.simulator.scene.shape import Shape
 from hardware.simulator.simulate import LandmarkTracker
 from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_deformation
-from hardware.simulator.world import SimulatedWorld
+from hardware.simulator.world import SimulatedWorld, WorldSink
 from perception import shipped_file
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport
@@ -144,7 +144,7 @@ class FaultRunRecord:
     service_times: list[float] = field(default_factory=list)  # s, at which an operator refilled or reset a dispenser
 
 
-class FaultRun:
+class FaultRun(WorldSink):
     """One run with faults, from the first frame until the path is printed, the motion is killed, or `MAX_RUN_S`."""
 
     def __init__(
@@ -237,11 +237,6 @@ class FaultRun:
     def rows(self, log: NozzleLog) -> None:
         """The next rows of the truth at the nozzle."""
         self._logs.append(log)
-
-    def _ignore(self, *data: object, **named: object) -> None:
-        pass
-
-    picture = head = pose = event = wire = registration = look = _ignore
 
 
 class _ChangedStep:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from logging import WARNING
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -255,8 +255,8 @@ def _begin_rendering(pictures: PictureRenderer, now: float) -> None:
 Exposures = dict[tuple[int, float], Shot]  # by camera and stamp, s
 
 
-class PipelineSink(Protocol):
-    """Receives pictures, print head and poses."""
+class PipelineSink:
+    """Receives pictures, print head and poses; what a sink does not override is ignored."""
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture that can be decoded has arrived, as encoded by its camera."""

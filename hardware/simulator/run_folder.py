@@ -38,6 +38,7 @@ from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.deposit import NozzleLog, PlannedLine
 from hardware.simulator.nozzle_error import nozzle_errors
 from hardware.simulator.scenario import Scenario
+from hardware.simulator.world import WorldSink
 from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport, TrackingStep
 from planning.command import Move
@@ -195,7 +196,7 @@ def clear_run(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-class RunFolder:
+class RunFolder(WorldSink):
     """Writes a run; a context manager that leaves all files readable on any end."""
 
     def __init__(
@@ -315,9 +316,6 @@ class RunFolder:
             self._commands.send(data)
         if self._session is not None:
             (self._session[1].sent if sent else self._session[1].received)(stamp, data)
-
-    def pose_delivery(self, pose: SurfacePose) -> None:
-        """A pose has reached the motion; `pose` has written it."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
         """A tick, and the progress of the print by it; None before the path was placed."""

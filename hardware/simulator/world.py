@@ -16,7 +16,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from logging import INFO, WARNING
-from typing import Protocol
 
 import numpy as np
 
@@ -65,7 +64,7 @@ SERVICE_DELAY = 0.3  # s from a dispenser's fault until the operator resets it, 
 LOOK_DURATION = 2.5  # s for the evaluation of a look: 2 s on an idle core
 
 
-class WorldSink(PipelineSink, Protocol):
+class WorldSink(PipelineSink):
     """Receives everything that happens in a run."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
