@@ -30,6 +30,7 @@ from hardware.simulator.world import SimulatedWorld
 from planning.command import Command, Hold, Move
 from planning.material import bead_areas
 from tests import simulated_worlds
+from tests.fault_run import open_unattended
 from tests.moving_surfaces import path_through
 from tests.nozzle_logs import nozzle_log, straight
 
@@ -191,7 +192,7 @@ def test_told_on_counts_where_the_last_command_does_not_print(following: Command
     dispensers.add_command(following, TICK)  # and it is not followed
     assert dispensers.open_outside(0.08) == pytest.approx(outside)
     assert dispensers.open_outside(0.08, [(0.0, 1.0)]) == 0.0
-    assert dispensers.open_unattended([(0.01, 1.0)], 0.08) == pytest.approx(0.07)
+    assert open_unattended(dispensers, [(0.01, 1.0)], 0.08) == pytest.approx(0.07)
     dispensers.forbid(0.03)
     assert dispensers.open_outside(0.08) == pytest.approx(max(outside, 0.05))
 

@@ -11,7 +11,7 @@ squared errors over the last seconds, relative to the best one's.
 motion of a live run and the virtual arm, whose nozzle is compared with its true checkpoint every millisecond. Only the
 pose that the motion is given differs: the first one for ever, the last one at rest, the last one with its velocity, or
 the pose as it is. The first three state no error: only the arm's limits keep them from printing. One more scenario has
-a late dispenser: hardware/bench/fault_run.py.
+a late dispenser: hardware/bench/loop_run.py.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.bench import figures
-from hardware.bench.fault_run import (
+from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
+from hardware.bench.loop_run import (
     DELAYS_KNOWN,
     DELAYS_ZERO,
     LATE_DISPENSER,
     BeadsPrint,
-    FaultRun,
+    LoopRun,
     bead_figures,
     prepare_scenario,
     print_beads,
 )
-from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
 from hardware.bench.subjects import BREATHING
 from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock
@@ -329,8 +329,7 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
 
 def _print_case(seed: int, scenario: str, way: str) -> Print:
     prepared = prepare_scenario(shipped_file("scenarios", f"{scenario}.toml"))
-    log = FaultRun(prepared, (), seed, change=MOTION_INPUTS[way]())().log
-    assert log is not None
+    log = LoopRun(prepared, seed, change=MOTION_INPUTS[way]())()
     error = np.linalg.norm((log.base_from_nozzle - log.base_from_target)[:, :3, 3], axis=1)
     return Print(log.stamps, np.where(log.extrude, error, np.nan))
 

@@ -190,7 +190,7 @@ class SimulatedDispensers:
     def open_outside(self, until: float, unattended: Sequence[tuple[float, float]] = ()) -> float:
         """How long, s, until `until`, a device was commanded open while no move that prints was sent.
 
-        unattended: from, until, s: when no command could reach it; that time counts in `open_unattended`.
+        unattended: from, until, s: when no command could reach it; that time does not count.
         """
         begin = np.array([start for start, _ in self._permits])
         end = np.minimum([end for _, end in self._permits], np.append(begin[1:], until)[: len(begin)])
@@ -208,16 +208,6 @@ class SimulatedDispensers:
             length = np.diff(edges)
             outside += float(length[open_now & ~allowed & (length > ROUNDING)].sum())
         return outside
-
-    def open_unattended(self, unattended: Sequence[tuple[float, float]], until: float) -> float:
-        """The longest time, s, that a device stayed open since commands failed; unattended: from, until, s."""
-        longest = 0.0
-        for stamps, flows in map(self._switches, self.models):
-            for lost, restored in unattended:
-                if lost < until and flows[np.searchsorted(stamps, lost, "right") - 1] > 0:
-                    closed = stamps[(stamps > lost) & (flows == 0)]
-                    longest = max(longest, min(closed[0] if len(closed) else until, restored, until) - lost)
-        return longest
 
     def open_at(self, instants: Array) -> NDArray[np.bool_]:
         """Whether a device was open by its last command (N,), and had not closed itself, at instants (N,), s."""

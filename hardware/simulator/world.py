@@ -11,7 +11,7 @@ A simulated operator arms the arm once the path is placed, and again after a sto
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -87,13 +87,12 @@ class WorldSink(PipelineSink):
 
 
 class _SimulatedOperator:
-    """The orders of an operator. service_times: s, at which he refilled or reset a dispenser."""
+    """The orders of an operator."""
 
     def __init__(self, material: MaterialControl) -> None:
         self._material = material
         self._last_order, self._unready_since = -math.inf, -math.inf
         self._homed = False
-        self.service_times: list[float] = []
 
     def __call__(self, progress: PrintProgress | None, state: ArmState, tracking: bool, now: float) -> list[LoopOrder]:
         """state: of the arm. tracking: whether the newest pose is TRACKING."""
@@ -106,11 +105,9 @@ class _SimulatedOperator:
         unready = self._material.reason
         self._unready_since = self._unready_since if unready else now
         if progress.wanted and progress.wanted != LOOK:
-            self.service_times.append(now)
             orders.append(PauseOrder.MATERIAL_IN)
         elif unready and now >= self._unready_since + SERVICE_DELAY:
             self._unready_since = now
-            self.service_times.append(now)
             orders.append(PauseOrder.RESUME)
         if state not in (ArmState.STOPPED, ArmState.DISARMED) or not tracking or now < self._last_order + ORDER_PERIOD:
             return orders
@@ -200,29 +197,10 @@ class SimulatedWorld:
         """Give the motion an order."""
         self._queued_orders.append(order)
 
-    def every(self, period: float, action: Callable[[float], None]) -> None:
-        """Call `action` with the instant, s, every `period` s from 0 s on."""
-
-        def act(now: float) -> None:
-            self._events.at(now + period, TICK_EVENT, act)
-            action(now)
-
-        self._events.at(0.0, TICK_EVENT, act)
-
-    @property
-    def service_times(self) -> list[float]:
-        """Instants, s, at which the operator refilled or reset a dispenser."""
-        return self._operator.service_times
-
     @property
     def open_outside(self) -> float:
         """How long, s, a dispenser was commanded open until now while no move that prints was sent."""
         return self.dispensers.open_outside(self.elapsed, self._unattended)
-
-    @property
-    def open_unattended(self) -> float:
-        """The longest time, s, that a dispenser stayed open after its line or the motion failed."""
-        return self.dispensers.open_unattended(self._unattended, self.elapsed)
 
     @property
     def elapsed(self) -> float:
