@@ -31,7 +31,6 @@ on = "ON {flow_ul_s}"
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -45,6 +44,7 @@ from hardware.dispenser.dispenser import ArmAxisDispenser, ArmPwmDispenser, Disp
 from hardware.dispenser.line_dispenser import LineDispenser, opener_for
 from hardware.dispenser.messages import PRESETS, DispenserLine, DispenserMessages, MessageValues, Preset
 from hardware.process import checks
+from hardware.process.progress import write_atomically
 from planning.material import Outlet, Outlets, SwitchDelay
 
 ARM_PWM, ARM_AXIS = "arm_pwm", "arm_axis"
@@ -294,6 +294,4 @@ def write_delays(path: str | Path, name: str, delays: DispenserProfile) -> None:
             body[at] = re.sub(r"=\s*[^#\s]+", f"= {value}", body[at], count=1)
     text = "\n".join([*lines[:start], *replacement, *body, *lines[end:]]) + "\n"
     dispensers_from_text(text, path)
-    partial = path.with_name(path.name + ".new")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

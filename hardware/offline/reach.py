@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path as File
@@ -14,6 +13,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, far_limits_text, unreached_limits_text
 from hardware.files.arm_file import read_arm, tool_body_of
+from hardware.files.folder_tables import csv_table
 from hardware.files.mesh_file import read_mesh
 from hardware.files.path_file import read_path, write_path
 from hardware.process.clock import WallClock
@@ -386,13 +386,11 @@ def _write(out: File, path: Path, reach: Reach) -> None:
     table = np.column_stack(
         [np.rad2deg(reach.joints), *angles, reach.shoulder, reach.manipulability, reach.speed, np.rad2deg(reach.spin)]
     )
-    with (out / "reach.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        more = (f"j{i}_deg" for i in range(7, reach.joints.shape[1] + 1))
-        writer.writerow([*REACH_COLUMNS[:9], *more, *REACH_COLUMNS[9:]])
+    more = (f"j{i}_deg" for i in range(7, reach.joints.shape[1] + 1))
+    with csv_table(out / "reach.csv", [*REACH_COLUMNS[:9], *more, *REACH_COLUMNS[9:]]) as write_row:
         for i, row in enumerate(table.tolist()):
             numbers = [f"{value:.4f}" if np.isfinite(value) else "" for value in row]
-            writer.writerow([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])
+            write_row([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])
 
 
 def _smallest(values: Array, digits: int = 1) -> str:

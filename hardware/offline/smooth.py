@@ -8,7 +8,6 @@ summary last, so any worker can start it again. All workers must reach sessions 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import io
 import json
@@ -24,7 +23,7 @@ from estimation.batch.smooth import smooth
 from estimation.batch.smoothed import REFINED_PRIOR, CalibrationPrior, Smoothed
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
-from hardware.files.folder_tables import write_tum
+from hardware.files.folder_tables import csv_table, write_tum
 from hardware.files.rig_file import write_rig
 from hardware.files.session import Session, damage_text
 from hardware.offline.smooth_report import SmoothEvaluation, evaluate_smoothed, smooth_page, smooth_verdict
@@ -315,16 +314,14 @@ def smooth_job(job: SmoothJob, options: SmoothOptions) -> SmoothOutcome:
 def write_table(path: Path, jobs: Iterable[SmoothJob], outcomes: Iterable[SmoothOutcome]) -> None:
     """sessions.csv: a line for each job, in their order; those without an outcome are "not done"."""
     known = {outcome.job: outcome for outcome in outcomes}
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["session", "state", "reason", "folder", "spent_s", *SUMMARY_FIGURES])
+    with csv_table(path, ["session", "state", "reason", "folder", "spent_s", *SUMMARY_FIGURES]) as write:
         for job in jobs:
             outcome = known.get(job, SmoothOutcome(job, "not done", "interrupted", 0.0))
             done = outcome.state in (SMOOTHED, ALREADY_DONE)
             figures = _summary(job.out) if done else {}
             reason = "" if done else " ".join(outcome.text.split())
             head = [str(job.session), outcome.state, reason, str(job.out), f"{outcome.spent:.1f}"]
-            writer.writerow([*head, *("" if figures.get(key) is None else figures[key] for key in SUMMARY_FIGURES)])
+            write([*head, *("" if figures.get(key) is None else figures[key] for key in SUMMARY_FIGURES)])
 
 
 def _outcome(job: SmoothJob, options: SmoothOptions, stream: TextIO | None) -> SmoothOutcome:
