@@ -33,8 +33,8 @@ from hardware.report.evaluation import (
     fixed_row,
     percent,
 )
-from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
-from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components
+from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.report import COMPONENTS_TEXT, PAGE_CHART_WIDTH, component_plots, components
 
 ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")  # keys of compare.json
 ALIGNMENT_LABELS = dict(
@@ -281,18 +281,10 @@ def _tiles(comparison: TrajectoryComparison) -> str:
 def _trajectory(comparison: TrajectoryComparison) -> str:
     fitted = comparison.fitted
     values, expected = (components(poses, fitted.reference[0]) for poses in (fitted.estimated, fitted.reference))
-    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
-    plots = []
-    for i in (0, 3, 1, 4, 2, 5):
-        scale = spanning([values[:, i], expected[:, i]], 0.12, 0.5)
-        plot = Plot(HALF_CHART_WIDTH, 165, comparison.span, scale, label=names[i])
-        plot.line(comparison.stamps, expected[:, i], "truth")
-        plot.line(comparison.stamps, values[:, i], "estimate")
-        plots.append(plot.svg())
+    plots = component_plots(comparison.span, comparison.stamps, {"truth": expected, "estimate": values})
     sources = ("estimate", comparison.estimated), ("truth", comparison.reference)
     keys = legend([line_key(style, _short(series.name)) for style, series in sources])
-    words = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
-    return section("Trajectories", words, f'{keys}<div class="two">{"".join(plots)}</div>')
+    return section("Trajectories", COMPONENTS_TEXT, keys + plots)
 
 
 def _absolute(comparison: TrajectoryComparison) -> str:
