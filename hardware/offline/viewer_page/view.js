@@ -3,7 +3,7 @@ import { inverse, moved, product } from "./lens.js";
 import { Panes } from "./panes.js";
 import { SceneView } from "./scene.js";
 import { onTheme, themeButton } from "./theme.js";
-import { Timeline } from "./timeline.js";
+import { Timeline, trace } from "./timeline.js";
 import { figure, TRACKING } from "./words.js";
 
 const WAY = 4000; // points of the trajectory that are drawn
@@ -19,17 +19,10 @@ class Film extends SceneView {
     if (!this.scene || !state.session) return;
     const g = this.canvas.getContext("2d"), place = this.project(this.canvas.width, this.canvas.height), all = state.session.places;
     const every = Math.max(1, Math.ceil(all.length / WAY)), ratio = window.devicePixelRatio || 1;
-    for (const [from, to, colour] of [[0, all.length, "rgb(138 79 160 / .3)"], [0, state.k + 1, "#8a4fa0"]]) {
+    for (const [end, colour] of [[all.length, "rgb(138 79 160 / .3)"], [state.k + 1, "#8a4fa0"]]) {
       g.strokeStyle = colour;
       g.lineWidth = 1.6 * ratio;
-      g.beginPath();
-      let pen = false;
-      for (let i = from; i < to; i += every) {
-        const p = all[i] && place(all[i]);
-        if (p) pen ? g.lineTo(p[0], p[1]) : g.moveTo(p[0], p[1]);
-        pen = Boolean(p);
-      }
-      g.stroke();
+      trace(g, end, every, (i) => all[i] && place(all[i]));
     }
     if (view && view.tracking) this.axes(g, place, view.tracking.base_from_surface, ratio);
   }
