@@ -251,12 +251,11 @@ class LiveLooks:
             return None
         text = f"looked at: nothing could be judged, and the path goes on as planned ({type(error).__name__}: {error})"
         self.text = NOTHING_JUDGED if error is None else text
-        self.count, look = self.count + 1, self._looks.last
-        if look is None:
-            return None
+        self.count += 1
         if self._adapt is not None and (shares := self._looks.adapted()) is not None:
             self._adapt(shares)
-            look = replace(look, flow=shares)
+        if (look := self._looks.last) is None:
+            return None
         self.text = f"looked at: {look.text}"
         return replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
 
