@@ -7,7 +7,6 @@ calibrated mm.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +19,6 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series, read_truth_series
 from hardware.process.progress import prepare_out
-from hardware.process.system import provenance
 from hardware.report.evaluation import (
     NEES_BOUND,
     PoseErrors,
@@ -29,9 +27,9 @@ from hardware.report.evaluation import (
     consistency_text,
     errors_under,
     figure,
-    finite,
     fixed_row,
     percent,
+    write_summary,
 )
 from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, tile
 from hardware.report.report import COMPONENTS_TEXT, PAGE_CHART_WIDTH, component_plots, components
@@ -369,7 +367,6 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     if (out / "summary.json").exists():
         raise InputError(out, "--out", "with another command's report", "a new folder, or one of stillbed compare")
     prepare_out(out, force=True)
-    figures = json.dumps(finite(comparison_figures(comparison) | {"provenance": provenance().table()}), indent=2)
-    (out / "compare.json").write_text(figures + "\n", encoding="utf-8")
+    write_summary(out / "compare.json", comparison_figures(comparison))
     (out / "report.html").write_text(comparison_page(comparison), encoding="utf-8")
     return f"{report}\nreport: {out / 'report.html'}"

@@ -31,9 +31,9 @@ from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reob
 from hardware.offline.trajectory_files import write_copy, write_instants, write_map
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, check_apart, prepare_out
-from hardware.process.system import file_hash, provenance
+from hardware.process.system import file_hash
 from hardware.recording.session_reader import open_session
-from hardware.report.evaluation import finite
+from hardware.report.evaluation import write_summary
 
 SUMMARY_FILE = "summary.json"
 LAST_PASS = "covariances"  # how many there are before it, nobody knows: each tells how far it is itself
@@ -79,8 +79,7 @@ def smooth_session(path: Path, out: Path, options: SmoothOptions, stream: TextIO
     text = f"{words}\nreport: {report}"
     report.write_text(smooth_page(session.path.name, words, result, evaluation), encoding="utf-8")
     summary = {"contents": contents, "text": text, **_figures(result, evaluation, session), **reobserved.figures}
-    summary["provenance"] = provenance().table()
-    (out / SUMMARY_FILE).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
+    write_summary(out / SUMMARY_FILE, summary)
     return False, text
 
 

@@ -317,12 +317,12 @@ def follow(
 def _write_report(out: Path, session: Session, complete: bool, method: str) -> str:
     """Evaluate the poses.csv in `out` into report.html and summary.json there; returns the summary as text."""
     from hardware.files.pose_file import read_poses
-    from hardware.report.evaluation import evaluate, summary_text, write_summary
+    from hardware.report.evaluation import as_dict, evaluate, summary_text, write_summary
     from hardware.report.report import write_report
 
     since = min((roi.stamp for roi in session.roi), default=float("-inf"))
     table = read_poses(out / "poses.csv")
     result = evaluate(table, session.truth, session.path.name, since, complete, session.damage, method)
-    write_summary(out / "summary.json", result)
+    write_summary(out / "summary.json", as_dict(result))
     write_report(out / "report.html", result)
     return summary_text(result)

@@ -7,7 +7,6 @@ them nearly all of the time of a simulated second; its estimator is that of a li
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -36,8 +35,7 @@ from hardware.offline.track import FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import Progress, prepare_out
-from hardware.process.system import provenance
-from hardware.report.evaluation import Evaluation, evaluate, write_summary
+from hardware.report.evaluation import Evaluation, as_dict, evaluate, write_summary
 from hardware.report.page import open_in_browser
 from hardware.report.report import write_report
 from hardware.simulator.camera_pipeline import Exposures, PictureStore
@@ -307,8 +305,7 @@ def _write_results(
     run = NozzleRun(title, log, path, bead, limits, open_outside, tracking, complete, pictures, files, looks)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
-    summary["provenance"] = provenance().table()
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_summary(out / "summary.json", summary)
     (out / "report.html").write_text(nozzle_page(result), encoding="utf-8")
     folder.watch.finish(summary["verdict"][0])
     busy = f"{skipped} frame sets found the tracker busy and were left out\n" if skipped else ""
@@ -324,7 +321,7 @@ def _tracking_report(
     tracking = scenario.tracking
     method = tracking.method if tracking.pictures else "tracks" if tracking.tracks else "truth"
     result = evaluate(table, trajectory, scenario.title, start, complete, method=method)
-    write_summary(folder / "summary.json", result)
+    write_summary(folder / "summary.json", as_dict(result))
     write_report(folder / "report.html", result)
     return result
 
