@@ -233,7 +233,7 @@ def _with_tissue(
     spun = replace(path, surface_from_nozzle=spin_path(path, reach.spin))
     try:
         body = tool_body_of(profile, BASE_MARGIN + question.amplitude_mm)
-        room, part = path_rooms(read_mesh(scan).scan, spun, body)
+        room, part = path_rooms(read_mesh(scan), spun, body)
     except InputError as error:
         raise InputError(scan, error.what, error.got, error.allowed) if error.where == "scan" else error from None
     short, worst = room < 0, int(room.argmin())

@@ -113,7 +113,7 @@ def tracker(
     from perception.tracking.step import TrackingStep
     from perception.tracking.wound_step import RegionTrackingStep
 
-    scan = read_mesh(surface).scan if isinstance(surface, Path) else surface
+    scan = read_mesh(surface) if isinstance(surface, Path) else surface
     if len(rig) < 2:
         raise InputError("rig", "cameras", len(rig), "2 or more: one camera sees no depth")
     with ProcessPoolExecutor(1, SPAWN, _start_map_process) as executor:
