@@ -95,7 +95,6 @@ class ArmEvent:
     stamp: float  # s
     text: str
     state: ArmState | None = None  # the new state; None where it stayed
-    by_operator: bool = False
 
 
 def axes_text(axes: Array) -> str:
@@ -283,8 +282,7 @@ class ArmDevice:
 
     def _change(self, state: ArmState, reason: str, now: float) -> None:
         if (state, reason) != (self.state, self.reason):
-            by_operator = isinstance(reason, Reason) and reason.code is LinkCode.OPERATOR
-            self._events.append(ArmEvent(now, f"{state.value}: {reason}", state, by_operator))
+            self._events.append(ArmEvent(now, f"{state.value}: {reason}", state))
         self.state, self.reason = state, reason
 
     def _note(self, text: str, now: float) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm import protocol
-from hardware.arm.device import ArmState
+from hardware.arm.device import BY_OPERATOR, ArmState
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
@@ -227,7 +227,9 @@ class LinkRun:
     def _count_run(self) -> None:
         counts, virtual, events = self._counts, self._virtual, self._arm.events()
         counts.unplugged += sum(event.state is ArmState.UNPLUGGED for event in events)
-        counts.faults += sum(event.state is ArmState.STOPPED and not event.by_operator for event in events)
+        counts.faults += sum(
+            event.state is ArmState.STOPPED and not event.text.endswith(BY_OPERATOR) for event in events
+        )
         counts.frames += virtual.frames
         counts.overflows += len(virtual.ignored)
         counts.refused += len(virtual.refused)
