@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -248,27 +247,18 @@ class _Operator:
 
 
 @contextmanager
-def _running(*processes: BaseProcess) -> Iterator[None]:
+def burning(count: int) -> Iterator[None]:
+    """So many processes that want a core each, of ordinary priority, as another user's."""
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=_burn, daemon=True) for _ in range(count)]
     for process in processes:
         process.start()
     try:
         yield
     finally:
-        _kill(*processes)
-
-
-def _kill(*processes: BaseProcess) -> None:
-    for process in processes:
-        process.kill()
-        process.join()
-
-
-@contextmanager
-def burning(count: int) -> Iterator[None]:
-    """So many processes that want a core each, of ordinary priority, as another user's."""
-    context = multiprocessing.get_context("spawn")
-    with _running(*(context.Process(target=_burn, daemon=True) for _ in range(count))):
-        yield
+        for process in processes:
+            process.kill()
+            process.join()
 
 
 def _burn() -> None:

@@ -194,7 +194,7 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
 
 def smooth_page(title: str, words: str, result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The page as HTML text. words: the verdict."""
-    body = [_tiles(evaluation), _trajectory(result, evaluation), _live(result, evaluation), _errors(evaluation)]
+    body = [_tiles(evaluation), _trajectory(result), _live(result, evaluation), _errors(evaluation)]
     body += [_residuals(result), _spectrum(evaluation.spectrum), _errors_by_delay(evaluation), _cameras(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
     return document("stillbed smooth", title, words, [part for part in body if part], footer)
@@ -214,7 +214,7 @@ def _tiles(evaluation: SmoothEvaluation) -> str:
     return row_of_tiles(tiles)
 
 
-def _trajectory(result: Smoothed, evaluation: SmoothEvaluation) -> str:
+def _trajectory(result: Smoothed) -> str:
     values = components(result.states.poses, result.states.poses[0])
     sigma = deviations(result.states.poses, result.covariance[:, :6, :6])
     plots = component_plots(_span(result), result.stamps, {"estimate": values}, sigma)
@@ -271,16 +271,11 @@ def _residuals(result: Smoothed) -> str:
     for i, camera in enumerate(result.rig.cameras):
         plot.line(result.stamps, rms[:, i], f"series c{i % 5}")
         keys.append(line_key(f"series c{i % 5}", camera.name))
-        by_part = [_root_mean_square(rms[part, i]) for part in parts]
+        by_part = [spread(rms[part, i][np.isfinite(rms[part, i])]).rmse for part in parts]
         rows.append([camera.name, *(figure(v) for v in by_part), f"{100 * used[i] / max(seen[i], 1):.1f} %"])
     head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(RESIDUAL_PARTS)), "inlier tracks"]
     text = "Reprojection error of the inlier tracks of each camera."
     return section("Residuals", text, legend(keys) + plot.svg() + figures_table(head, rows))
-
-
-def _root_mean_square(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
 def _spectrum(spectrum: MotionSpectrum) -> str:

@@ -272,10 +272,7 @@ class _RecordCopier:
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             self._channels[record.id] = record
-        elif isinstance(record, Message) and self._channels[record.channel_id].topic not in (
-            SMOOTHED_TOPIC,
-            VIEWERS_TOPIC,
-        ):
+        elif isinstance(record, Message) and self._channels[record.channel_id].topic not in ADDED_TOPICS:
             number, m = self._number(record.channel_id), record
             self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
 
