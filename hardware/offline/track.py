@@ -50,7 +50,8 @@ class FrameSetStep(Protocol):
         """The pose at `frames.stamp`."""
 
     def idle(self) -> None:
-        """Do the work that no pose waits for."""
+        """Do the work that no pose waits for; there is none by default."""
+        return
 
 
 @contextmanager

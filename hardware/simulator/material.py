@@ -209,18 +209,13 @@ class SimulatedDispensers:
             outside += float(length[open_now & ~allowed & (length > ROUNDING)].sum())
         return outside
 
-    def open_at(self, instants: Array) -> NDArray[np.bool_]:
-        """Whether a device was open by its last command (N,), and had not closed itself, at instants (N,), s."""
-        is_open = np.zeros(len(instants), bool)
-        for stamps, flows in map(self._switches, self.models):
-            is_open |= flows[np.searchsorted(stamps, instants, "right") - 1] > 0
-        return is_open
-
     def flow(self, instants: Array, planned: Array) -> Array:
         """The true flow (N,), mm^3/s, at instants (N,), s. planned: (N,) mm^3/s, what the bead needs."""
         share = self._passing_share(instants)
-        if self.ideal:
-            return np.asarray(planned * self.open_at(instants) * share)
+        if self.ideal:  # the planned one while a device is open by its last command, and has not closed itself
+            switches = map(self._switches, self.models)
+            is_open = [flows[np.searchsorted(stamps, instants, "right") - 1] > 0 for stamps, flows in switches]
+            return np.asarray(planned * np.any(is_open, axis=0) * share)
         return np.asarray(sum(model.flow_at(instants) for model in self.models) * share)
 
     def _passing_share(self, instants: Array) -> Array:

@@ -52,7 +52,7 @@ from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_d
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, Roi
 from perception.tracking import MAP_METHOD
-from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
+from perception.tracking.step import STAGES, TrackingStep, report_without_offsets
 from planning.laid_beads import with_looks
 from planning.material import is_metered
 from planning.path import Path as Checkpoints
@@ -66,10 +66,8 @@ USABLE_GAINS = 0.2, 4.0  # of a picture with visible landmarks
 MIN_INITIAL_TRACKS = 30  # of the first pose
 
 
-class LandmarkTracker:
+class LandmarkTracker(FrameSetStep):
     """A tracking step without pictures, from projected landmarks."""
-
-    last: StepReport
 
     def __init__(
         self, true_rig: Rig, known_rig: Rig, truth: Truth, shape: Shape, shot: Callable[[int, float], Shot], seed: int
@@ -94,9 +92,6 @@ class LandmarkTracker:
         used = np.bincount(observations.camera, minlength=self._cameras)
         self.last = report_without_offsets(observations, used, np.zeros(len(STAGES)))
         return pose
-
-    def idle(self) -> None:
-        """There is nothing else to do."""
 
     def _pose(self, observations: Observations) -> SurfacePose:
         if self._follower is not None:
@@ -131,10 +126,8 @@ class LandmarkTracker:
 EXACT_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but invertible
 
 
-class OracleTracker:
+class OracleTracker(FrameSetStep):
     """A tracking step without pictures, from the truth."""
-
-    last: StepReport
 
     def __init__(self, truth: Truth, offset: Array, exposed: Callable[[int, float], float], cameras: int) -> None:
         """offset: (4, 4) known_base_from_base, by the errors of the known rig.
@@ -152,9 +145,6 @@ class OracleTracker:
         self.last = report_without_offsets(observations, counts, np.zeros(len(STAGES)))
         surface_pose = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
         return replace(surface_pose, forecast=self._predictor.add(surface_pose))
-
-    def idle(self) -> None:
-        """There is nothing else to do."""
 
 
 # faults that pictures show
