@@ -92,10 +92,8 @@ def run_link(options: argparse.Namespace) -> list[Figure]:
     machine = f"{priority}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
     stops, orders = calm.stops + halted.stops + rough.stops, calm.orders + rough.orders
     note = f"{halted.halts} halts up to 600 ms, {len(halted.arms) - 1} returns of the device"
-    stop_name, moving = (
-        f"{name}: stop on the wire after its decision, 99 %",
-        sum(p.arms[-1].left > 0 for p in parts[:2]),
-    )
+    stop_name = f"{name}: stop on the wire after its decision, 99 %"
+    moving = sum(p.arms[-1].left > 0 for p in parts[:2])
     return [
         Figure(f"{name}: ticks a second", calm.rate, "Hz", at_least(49.5), "thesis 30", machine),
         Figure(f"{name}: tick late, median", 1000 * lateness.median, "ms"),
