@@ -258,9 +258,10 @@ def _check_pairs(scenario: Scenario, scene: Scene) -> None:
     if (scenario.strain is None) != (scene.deformation == UNDEFORMED):
         allowed = "both (how much over time, and of what) or neither"
         raise InputError(scenario.file, "strain, scene.deformation", "one of the two", allowed)
-    if scenario.looks is not None and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
+    by_pictures = scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD
+    if scenario.looks is not None and not by_pictures:
         raise InputError(scenario.file, "look", scenario.looks, 'with tracking.by = "pictures": cameras look')
-    if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
+    if scenario.tracking.scan and not by_pictures:
         allowed = 'with by = "pictures": nothing else registers to a scan'
         raise InputError(scenario.file, "tracking.register", "scan", allowed)
     if not (scenario.tracking.pictures or scenario.tracking.tracks):
