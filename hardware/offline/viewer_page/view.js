@@ -10,6 +10,7 @@ const WAY = 4000; // points of the trajectory that are drawn
 const AXES = ["#c8553d", "#4c9a6a", "#2a6f97"]; // of the surface frame: x, y, z
 const GIVEN = { truth: "Truth", reference: "Reference" }; // poses that nobody estimated have no state
 const by = (id) => document.getElementById(id);
+const text = (tag, words) => Object.assign(document.createElement(tag), { textContent: words });
 const state = { session: null, k: 0, wanted: -1, busy: false, seen: null, poses: null, first: null, playing: false, begun: 0, from: 0, chosen: null, near: true };
 const panes = new Panes(by("pictures"), choose);
 
@@ -67,10 +68,7 @@ function go(k) {
   const last = state.session.stamps.length - 1;
   state.k = Math.min(Math.max(Math.round(k), 0), last);
   by("time").value = state.k;
-  const t = state.session.stamps[state.k];
-  const small = document.createElement("small");
-  small.textContent = `${state.k + 1} of ${last + 1}`;
-  by("now").replaceChildren(`${t.toFixed(2)} s`, small);
+  by("now").replaceChildren(`${state.session.stamps[state.k].toFixed(2)} s`, text("small", `${state.k + 1} of ${last + 1}`));
   state.wanted = state.k;
   fetchNewest();
   refresh();
@@ -119,11 +117,7 @@ function show() {
   const about = !tracking ? { word: "No pose", tone: "" } : given ? { word: given, tone: "wait" } : TRACKING[tracking.state];
   by("chip").textContent = about.word;
   document.body.dataset.tone = about.tone;
-  const put = (name, value, unit) => {
-    const small = document.createElement("small");
-    small.textContent = value === "–" ? "" : unit;
-    document.querySelector(`[data-tile=${name}] b`).replaceChildren(value, small);
-  };
+  const put = (name, value, unit) => document.querySelector(`[data-tile=${name}] b`).replaceChildren(value, text("small", value === "–" ? "" : unit));
   if (tracking && !state.first) state.first = tracking.base_from_surface;
   const change = tracking && product(inverse(state.first), tracking.base_from_surface);
   const sine = change && Math.hypot(change[2][1] - change[1][2], change[0][2] - change[2][0], change[1][0] - change[0][1]) / 2;
@@ -142,16 +136,8 @@ function show() {
 function tell() {
   const { stamps, held, events, stages } = state.session, now = stamps[state.k];
   const before = (all) => all.filter(([t]) => t <= now), stage = before(stages).pop();
-  const lines = [held[state.k] && `held: ${held[state.k]}`, stage && `stage: ${stage[1]}`].filter(Boolean).map((words) => {
-    const line = document.createElement("b");
-    line.textContent = `${words}  `;
-    return line;
-  });
-  const said = before(events).slice(-2).reverse().map(([t, words]) => {
-    const line = document.createElement("div");
-    line.textContent = `${t.toFixed(2)} s  ${words}`;
-    return line;
-  });
+  const lines = [held[state.k] && `held: ${held[state.k]}`, stage && `stage: ${stage[1]}`].filter(Boolean).map((words) => text("b", `${words}  `));
+  const said = before(events).slice(-2).reverse().map(([t, words]) => text("div", `${t.toFixed(2)} s  ${words}`));
   by("told").replaceChildren(...lines, ...said);
 }
 
