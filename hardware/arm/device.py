@@ -224,11 +224,6 @@ class ArmDevice:
         self._reopen_at = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)
 
-    @property
-    def origin(self) -> Array:
-        """(3,) mm in machine axes, from which the arm counts."""
-        return self.driver.origin
-
     def _read(self, now: float) -> list[Reply]:
         """Take the answers that have come; gives those about the arm's origin."""
         reported = self.driver.state(now)
