@@ -22,7 +22,7 @@ from hardware.arm.queue import ArmQueue
 from hardware.arm.s6h4d import S6H4D
 from hardware.process.clock import Clock, SimClock, WallClock, WatchedClock
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults, VirtualDevice, run_virtual_arm
+from hardware.simulator.arm.ports import VirtualDevice, run_virtual_arm
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Move
 
@@ -127,10 +127,10 @@ class VirtualTimeBench(ArmBench):
         _silence(self.arm.driver)
 
     def unplug(self) -> None:
-        self.device.faults = PortFaults(away=[(self.clock.now(), np.inf)])
+        self.device.away = [(self.clock.now(), np.inf)]
 
     def plug(self) -> None:
-        self.device.faults = PortFaults()
+        self.device.away = ()
 
 
 class PtyBench(ArmBench):

@@ -14,9 +14,9 @@ from hardware.arm.s6h4d import S6H4D
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults, VirtualDevice
 from hardware.simulator.arm.settings import ArmSettings
 from planning.command import Hold, Move
+from tests.faulty_port import FaultyDevice, PortFaults
 from tests.virtual_arm import HOME
 
 STEP = 0.001  # s between looks
@@ -36,7 +36,7 @@ def waiting(duration: float) -> Hold:
 class Linked:
     clock: SimClock
     virtual: VirtualArm
-    device: VirtualDevice
+    device: FaultyDevice
     arm: Arm
     deepest: float = 0.0  # s in flight by the model
     phase: float = 0.0  # s of the round motion that were sent
@@ -99,7 +99,7 @@ def linked(
     clock, profile = SimClock(), ArmProfile() if profile is None else profile
     settings = ArmSettings(servo_lag=0.0) if settings is None else settings
     virtual = VirtualArm(settings, profile.dialect, begin, faults, profile.baud)
-    device = VirtualDevice(virtual, clock, profile.baud, port)
+    device = FaultyDevice(virtual, clock, profile.baud, port)
     made = Linked(clock, virtual, device, Arm(S6H4D(device, profile), profile, 0.0, link or LinkSettings()))
     if stand:
         assert made.arm.stand(begin, 0.0) == "" and made.arm.arm(0.0) == ""

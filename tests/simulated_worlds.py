@@ -29,7 +29,7 @@ from hardware.simulator.scene.scene import UNDEFORMED, Scene
 from hardware.simulator.scene.shape import Deformation, flat
 from hardware.simulator.simulate import LandmarkTracker, OracleTracker
 from hardware.simulator.truth import Truth
-from hardware.simulator.world import SimulatedWorld
+from hardware.simulator.world import SimulatedWorld, WorldSink
 from perception.frames import FrameSet, PrintHead
 from perception.tracking.step import StepReport
 from planning.command import Command, Hold
@@ -51,7 +51,7 @@ SMALL = {  # pictures of a ninth of the usual size, half as often
 }
 
 
-class Heard:
+class Heard(WorldSink):
     """A sink that remembers everything it is told."""
 
     def __init__(self) -> None:
@@ -77,9 +77,6 @@ class Heard:
     def pose(self, frames: FrameSet, pose: SurfacePose, report: StepReport, spent: float) -> None:
         self.frames.append(frames)
         self.poses.append(pose)
-
-    def pose_delivery(self, pose: SurfacePose) -> None:
-        pass
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
         if progress is not None:

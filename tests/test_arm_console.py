@@ -28,12 +28,13 @@ from hardware.files.arm_file import read_arm, write_arm
 from hardware.files.rig_file import ImageSource, write_rig
 from hardware.process.clock import SimClock
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults, VirtualDevice, _serve, open_pty
+from hardware.simulator.arm.ports import _serve, open_pty
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from hardware.simulator.watched_arm import WatchedArm, watched_arm
 from perception.frames import SYRINGE, Image
 from planning.kinematics import SimpleArm, nozzle_from_axes
 from tests.camera_streams import CLOCK, HttpCamera, served
+from tests.faulty_port import FaultyDevice, PortFaults
 from tests.test_arm_port import serving
 from tests.virtual_arm import HOME, arm_fault
 
@@ -47,7 +48,7 @@ def asked(
     clock, profile = SimClock(), ArmProfile()
     arm = VirtualArm(ArmSettings(replies=replies), profile.dialect, AWAY, faults)
     lines: list[str] = []
-    status = run_arm(S6H4D(VirtualDevice(arm, clock, faults=port), profile), profile, request, clock, lines.append)
+    status = run_arm(S6H4D(FaultyDevice(arm, clock, faults=port), profile), profile, request, clock, lines.append)
     arm.advance(clock.now())
     return status, arm, lines
 

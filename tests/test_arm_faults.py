@@ -18,8 +18,8 @@ from hardware.arm.profile import LinkSettings
 from hardware.arm.protocol import encode
 from hardware.motion.loop import Order
 from hardware.process.faults import Fault, FaultKind, FaultPart, WorkRates
-from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, FaultyLine, ReplyMode
+from tests.faulty_port import PortFaults
 from tests.linked_arm import Linked, linked
 from tests.test_motion_loop import Looping
 from tests.virtual_arm import HOME, IDEAL, arm_fault, axes_at, motion, move, virtual_arm

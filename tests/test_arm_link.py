@@ -15,9 +15,9 @@ from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.protocol import Dialect, decode, encode
 from hardware.arm.queue import ArmQueue, FlowControl
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
+from tests.faulty_port import PortFaults
 from tests.linked_arm import Linked, circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault, virtual_arm
 

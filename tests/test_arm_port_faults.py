@@ -15,9 +15,10 @@ from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings, at_baud
 from hardware.arm.protocol import encode_reply
 from hardware.arm.s6h4d import S6H4D
-from hardware.simulator.arm.ports import PortFaults, VirtualPort
+from hardware.simulator.arm.ports import VirtualPort
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import feed_for
+from tests.faulty_port import PortFaults
 from tests.linked_arm import circle, linked, moving, waiting
 from tests.virtual_arm import HOME, arm_fault
 
@@ -224,7 +225,7 @@ def test_a_device_that_another_program_took_meanwhile_is_waited_for() -> None:
 
 def test_a_device_that_goes_while_a_frame_is_given_out_is_unplugged_and_nothing_is_thought_sent() -> None:
     link = linked()
-    link.device.faults = PortFaults(away=[(0.0, 1.0)])
+    link.device.away = [(0.0, 1.0)]
     frames = link.arm.frames
     assert link.arm.send(moving(HOME + [1, 0, 0, 0, 0, 0], 50.0), 0.0) == ""
     assert link.arm.state is ArmState.UNPLUGGED and link.arm.frames == frames and link.arm.target is None

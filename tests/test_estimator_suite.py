@@ -22,9 +22,9 @@ from estimation.online.surface_state import StateSettings
 from estimation.pose import SurfacePose, TrackState
 from estimation.synthetic.follow import Follower, FollowResult, Mapping, first_map, follow
 from estimation.synthetic.world import World, synthetic_world
-from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
 from planning.command import MotionLimits
 from tests.campaigns.estimator import nees, pool_errors
+from tests.fault_run import AXES_LIMITS, AxesOracle
 from tests.slow_cases import slowly
 
 TRACKING, DEGRADED, COASTING, LOST = (TrackState.TRACKING, TrackState.DEGRADED, TrackState.COASTING, TrackState.LOST)

@@ -15,8 +15,8 @@ import pytest
 
 from estimation.errors import InputError
 from estimation.se3 import Array
-from hardware.bench import fault_run
-from hardware.bench.fault_run import FaultRun, FaultRunRecord, Statement, prepare_scenario
+from hardware.bench import loop_run
+from hardware.bench.loop_run import prepare_scenario
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults, fault_from_text
 from hardware.simulator.deposit import NozzleLog
 from tests.campaigns import faults
@@ -37,6 +37,7 @@ from tests.campaigns.faults import (
     read_log,
     run_faults,
 )
+from tests.fault_run import FaultRun, FaultRunRecord, Statement
 
 SCENARIOS = Path(__file__).parents[1] / "data" / "scenarios"
 STAMPS, ROWS = np.arange(0.0, 8.0, 0.02), np.arange(0.001, 8.0, 0.001)
@@ -119,10 +120,10 @@ def test_what_never_comes_back_is_told_and_what_struck_no_print_is_left_out() ->
 
 
 def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fault_run, "MAX_RUN_S", 6.0)
+    monkeypatch.setattr(loop_run, "MAX_RUN_S", 6.0)
     texts = "motion hang at 3.2s for 0.4s", "tracking hang at 4.7s for 0.3s"
     faults = [fault_from_text("x", "y", text) for text in texts]
-    hung = FaultRun(prepare_scenario(SCENARIOS / "still.toml"), faults, 1)()
+    hung = FaultRun(prepare_scenario(SCENARIOS / "still.toml"), faults, 1).record()
     for fault, until in zip(faults, (4.7, 6.0), strict=True):
         verdict = judge_fault(hung, fault, until)
         assert verdict is not None and 0 < verdict.exposure == verdict.detected <= MAX_DETECTION
@@ -131,7 +132,7 @@ def test_a_process_that_hangs_is_told_within_a_tenth_of_a_second(monkeypatch: py
 
 @pytest.mark.slow  # single faults are judged above
 def test_a_run_of_a_scenario_is_judged_kept_and_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fault_run, "MAX_RUN_S", 8.0)
+    monkeypatch.setattr(loop_run, "MAX_RUN_S", 8.0)
     rows = one_run(1, 1)
     assert rows and all(row.over == 0 and not row.verdict.silent for row in rows)
     append_log(log := tmp_path / "faults.csv", rows)

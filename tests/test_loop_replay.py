@@ -23,11 +23,11 @@ from hardware.motion.loop import Order
 from hardware.motion.step import PauseOrder
 from hardware.recording.loop_record import LoopKeeper, LoopRecord
 from hardware.recording.recorder import Recorder
-from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.scenario import read_scenario
 from planning.command import Move
 from planning.material import FlowShares
 from planning.motion.planner import Planner
+from tests.fault_run import every
 from tests.live_runs import CLOCK, Running, light_runs, messages
 from tests.simulated_worlds import Heard, world_of, write_scenario
 
@@ -95,8 +95,8 @@ def simulated(
                     world.order(later[1])
                     later = next(told, (float("inf"), PauseOrder.PAUSE))
 
-            world.every(0.01, order)
-        world._device.faults = PortFaults(away=away)
+            every(world, 0.01, order)
+        world._device.away = away
         world.run()
     return file, sink
 

@@ -20,10 +20,10 @@ from hardware.dispenser.dispenser import ArmPwmDispenser, DispenserProfile, Disp
 from hardware.motion.loop import MaterialControl, MotionLoop, Order, Tick
 from hardware.motion.step import MotionStep
 from hardware.process.clock import SimClock
-from hardware.simulator.arm.ports import PortFaults
 from planning.command import Command, Hold, Move
 from planning.material import Outlet, SwitchDelay
 from tests.dispenser_bench import Bench
+from tests.faulty_port import PortFaults
 from tests.linked_arm import Linked, linked
 from tests.moving_surfaces import breathing, pose_at, raster
 from tests.slow_cases import slowly

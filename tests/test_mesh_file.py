@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 
 from estimation import se3
 from estimation.errors import InputError
-from estimation.scans.scan import Scan, ScanIndex, face_areas, face_normals
+from estimation.scans.scan import Scan, ScanIndex, face_areas, face_normals, open_edges
 from estimation.se3 import Array
 from hardware.files import mesh_file
-from hardware.files.mesh_file import MeshFile, write_ply
 from hardware.files.mesh_file import read_mesh as read_mesh_apart
 from hardware.files.mesh_file import read_raw_mesh as read_raw_mesh_apart
+from hardware.files.mesh_file import write_ply
 from hardware.files.mesh_reader import MAX_LINE_BYTES, MAX_MESH_ROWS, STL_HEADER_BYTES, MeshReader, RawMesh, _ending
 from hardware.plan.order import in_mm
 from tests import scans
@@ -42,7 +42,7 @@ def kept_reader() -> Iterator[None]:
     KEPT.clear()
 
 
-def read_mesh(path: Path) -> MeshFile:
+def read_mesh(path: Path) -> Scan:
     return read_mesh_apart(path, KEPT[0])
 
 
@@ -77,24 +77,24 @@ def refusal(path: Path) -> str:
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
 def test_every_format_gives_the_same_scan(tmp_path: Path, suffix: str) -> None:
     mesh = read_mesh(write(tmp_path / f"surface{suffix}", BALL))
-    assert mesh.open_edges == 0
-    assert mesh.scan.vertices.shape == BALL.vertices.shape and mesh.scan.triangles.shape == BALL.triangles.shape
+    assert not len(open_edges(mesh))
+    assert mesh.vertices.shape == BALL.vertices.shape and mesh.triangles.shape == BALL.triangles.shape
     tolerance = 1e-5 if suffix == ".stl" else 1e-9  # STL is single precision
-    np.testing.assert_allclose(np.linalg.norm(mesh.scan.vertices, axis=1), 30, atol=tolerance)
-    assert np.einsum("ni,ni->n", mesh.scan.normals, mesh.scan.vertices / 30).min() > 0.98
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 30, atol=tolerance)
+    assert np.einsum("ni,ni->n", mesh.normals, mesh.vertices / 30).min() > 0.98
 
 
 def test_the_synthetic_scan_comes_back_in_its_own_frame(tmp_path: Path) -> None:
     write_ply(tmp_path / "surface.ply", *scan_of(patch(), 4.0))
     mesh = read_mesh(tmp_path / "surface.ply")
-    on_patch = se3.transform_points(se3.inverse(SCAN_FROM_SURFACE), mesh.scan.vertices)
+    on_patch = se3.transform_points(se3.inverse(SCAN_FROM_SURFACE), mesh.vertices)
     np.testing.assert_allclose(np.hypot(on_patch[:, 1], on_patch[:, 2] + RADIUS), RADIUS, atol=1e-9)
-    assert (mesh.scan.normals @ SCAN_FROM_SURFACE[:3, 2]).min() > 0.8 and mesh.open_edges == 2 * (20 + 15)
+    assert (mesh.normals @ SCAN_FROM_SURFACE[:3, 2]).min() > 0.8 and len(open_edges(mesh)) == 2 * (20 + 15)
 
 
 def test_a_hole_is_counted_not_refused(tmp_path: Path) -> None:
     holed = Scan(BALL.vertices, BALL.triangles[1:], BALL.normals)
-    assert read_mesh(write(tmp_path / "holed.ply", holed)).open_edges == 3
+    assert len(open_edges(read_mesh(write(tmp_path / "holed.ply", holed)))) == 3
 
 
 @pytest.mark.parametrize("name", ["surface.ply", "surface.fbx", "surface"])
@@ -144,7 +144,7 @@ def test_a_scan_in_metres_is_called_one(tmp_path: Path) -> None:
 def test_the_size_that_is_allowed_ends_where_it_says(tmp_path: Path, side: float, allowed: bool) -> None:
     path = write(tmp_path / "surface.ply", BALL, side / 60)
     if allowed:
-        assert len(read_mesh(path).scan.triangles)
+        assert len(read_mesh(path).triangles)
     else:
         assert "1 to 2000 mm" in refusal(path)
 
@@ -154,7 +154,7 @@ def test_a_file_that_is_too_large_is_not_begun(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(mesh_file, "MAX_MESH_FILE_BYTES", path.stat().st_size - 1)
     assert "size of the file" in refusal(path)
     monkeypatch.setattr(mesh_file, "MAX_MESH_FILE_BYTES", path.stat().st_size)
-    assert read_mesh(path).open_edges == 0
+    assert not len(open_edges(read_mesh(path)))
 
 
 Corner = tuple[float, float, float]
@@ -422,7 +422,7 @@ def test_a_file_that_ends_the_library_is_one_error_and_the_next_is_read(tmp_path
     assert "SIGSEGV" in refused(
         tmp_path, "x.ply", DEADLY
     )  # open3d 0.20 cuts the polygon before it looks at its corners
-    assert len(read_mesh(write(tmp_path / "ball.ply", BALL)).scan.triangles)
+    assert len(read_mesh(write(tmp_path / "ball.ply", BALL)).triangles)
 
 
 def test_a_reader_that_is_gone_is_one_error(tmp_path: Path) -> None:
@@ -492,7 +492,7 @@ SCATTERED = np.random.default_rng(2).permutation(SKIN.vertices)
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
 def test_a_surface_is_laid_through_a_cloud_its_outside_up(tmp_path: Path, suffix: str) -> None:
-    mesh = read_mesh(cloud_file(tmp_path / f"cloud{suffix}", SCATTERED)).scan
+    mesh = read_mesh(cloud_file(tmp_path / f"cloud{suffix}", SCATTERED))
     assert face_areas(mesh).sum() == pytest.approx(face_areas(SKIN).sum(), rel=0.01)
     assert (face_normals(mesh)[:, 2] > 0).all()
     away = ScanIndex(SKIN).closest(mesh.corners.mean(axis=1)).points - mesh.corners.mean(axis=1)
@@ -502,7 +502,7 @@ def test_a_surface_is_laid_through_a_cloud_its_outside_up(tmp_path: Path, suffix
 def test_a_hole_in_a_cloud_stays_open_and_dust_is_left_out(tmp_path: Path) -> None:
     beside = np.linalg.norm(SCATTERED[:, :2], axis=1) > 6
     dust = np.array([[0.0, 0, 25], [3, 60, 10], [-70, 0, 0]])
-    mesh = read_mesh(cloud_file(tmp_path / "cloud.xyz", np.concatenate([SCATTERED[beside], dust]))).scan
+    mesh = read_mesh(cloud_file(tmp_path / "cloud.xyz", np.concatenate([SCATTERED[beside], dust])))
     expected = face_areas(SKIN).sum() - np.pi * 6**2
     assert face_areas(mesh).sum() == pytest.approx(expected, rel=0.02) and mesh.vertices[:, 2].max() < 10
 

@@ -21,10 +21,10 @@ from hardware.bench.link import LIVE_PARTS, run_part
 from hardware.motion.loop import CommandedPose, MotionLoop, Order, Tick, TickMotion
 from hardware.motion.step import MotionStep
 from hardware.process.clock import Histogram, SimClock
-from hardware.simulator.arm.ports import PortFaults
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Hold, Move
 from planning.kinematics import nozzle_from_axes
+from tests.faulty_port import PortFaults
 from tests.linked_arm import Linked, linked
 from tests.moving_surfaces import breathing, pose_at, raster
 from tests.virtual_arm import HOME, arm_fault

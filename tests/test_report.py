@@ -321,7 +321,7 @@ def test_states_are_counted_from_an_instant_on() -> None:
 
 def test_the_summary_is_plain_json_and_says_the_same_again(tmp_path: Path) -> None:
     result = evaluate(*run(60, sigma=SIGMA), "monday")
-    write_summary(tmp_path / "summary.json", result)
+    write_summary(tmp_path / "summary.json", as_dict(result))
     loaded = json.loads((tmp_path / "summary.json").read_text(), parse_constant=pytest.fail)
     assert set(loaded.pop("provenance")) >= {"started_utc", "stillbed", "commit", "host", "operator", "inputs_sha256"}
     assert loaded == as_dict(result) and loaded["states_since_s"] is None

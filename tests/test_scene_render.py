@@ -26,7 +26,7 @@ from hardware.files.images import decode, encode
 from hardware.simulator import camera_pipeline
 from hardware.simulator.camera_pipeline import PictureRenderer
 from hardware.simulator.cameras import Fate, Shot, TrueCameras
-from hardware.simulator.scene.appearance import Appearance, Sensor, unlit_texture
+from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState
 from hardware.simulator.scene.shape import (
@@ -53,6 +53,11 @@ MOVED = BASE_FROM_REST @ se3.exp(np.array([0.05, -0.08, 0.11, 3.3, -4.7, 6.1]))
 STRETCHED = Deformation((0.04, -0.02), 3.0, 25.0)
 
 
+def unlit(texture: Image) -> Appearance:
+    """The look of a picture (H, W, 3) BGR that is imaged as it is."""
+    return Appearance(texel=TEXEL, drape=False, texture=texture, lit=False)
+
+
 def instant(pose: Array = BASE_FROM_REST, **more: Any) -> WorldState:
     return WorldState(0.0, **{"exposure": 0.01, "base_from_surface": pose, "twist": np.zeros(6), **more})
 
@@ -75,7 +80,7 @@ def centres() -> Array:
 
 def dotted(radius: float = 55.0, deformation: Deformation = STRETCHED) -> Scene:
     shape = flat(PATCH) if np.isinf(radius) else cylinder(PATCH, radius)
-    scene = Scene(shape, unlit_texture(dots(centres()), TEXEL), deformation)
+    scene = Scene(shape, unlit(dots(centres())), deformation)
     scene.sheet.picture[:] = 0  # a black room
     return scene
 
@@ -298,7 +303,7 @@ def test_a_scan_is_drawn_in_its_own_frame() -> None:
 
 
 def test_a_patch_is_built_quickly_enough_for_tests() -> None:
-    scene = Scene(flat(PATCH), unlit_texture(dots(centres()), TEXEL))
+    scene = Scene(flat(PATCH), unlit(dots(centres())))
     assert scene.layers.size == (360, 480) and scene.opening == PATCH
 
 

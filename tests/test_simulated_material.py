@@ -20,7 +20,7 @@ from hardware.arm.driver import UnpluggedError
 from hardware.files.path_file import read_path
 from hardware.process.clock import SimClock
 from hardware.process.faults import fault_from_text
-from hardware.simulator.deposit import convolved, deposit_figures, deposit_map, planned_line, row_volumes
+from hardware.simulator.deposit import _disc, _spread, deposit_figures, deposit_map, planned_line, row_volumes
 from hardware.simulator.dispenser import DispenserModel, DispenserPort
 from hardware.simulator.material import BEAD_STEP, IDEAL, SimulatedDispensers, piece_ends
 from hardware.simulator.nozzle_error import MaterialFigures, material_figures, nozzle_errors
@@ -30,6 +30,7 @@ from hardware.simulator.world import SimulatedWorld
 from planning.command import Command, Hold, Move
 from planning.material import bead_areas
 from tests import simulated_worlds
+from tests.fault_run import open_unattended
 from tests.moving_surfaces import path_through
 from tests.nozzle_logs import nozzle_log, straight
 
@@ -59,9 +60,11 @@ def printed(
 
 @pytest.mark.parametrize(("rows", "columns", "width"), [(40, 31, 7), (2, 90, 1), (5, 4, 23)])
 def test_a_map_spread_by_a_disc_is_the_convolution(rows: int, columns: int, width: int) -> None:
-    draw = np.random.default_rng(width)
-    values, weights = draw.normal(size=(rows, columns)), draw.normal(size=(width, width))
-    assert np.abs(convolved(values, weights) - fftconvolve(values, weights, "same")).max() < 1e-12
+    values, disc = np.zeros((rows + 2, columns + 2)), _disc(width)
+    values[1:-1, 1:-1] = np.random.default_rng(width).random((rows, columns))
+    y, x = np.nonzero(values)
+    spread = _spread(np.column_stack([x, y]) + 0.5, values[y, x], values.shape, disc)
+    assert np.abs(spread - fftconvolve(values, disc, "same")).max() < 2e-9
 
 
 def figures(**dispenser: object) -> MaterialFigures:
@@ -191,7 +194,7 @@ def test_told_on_counts_where_the_last_command_does_not_print(following: Command
     dispensers.add_command(following, TICK)  # and it is not followed
     assert dispensers.open_outside(0.08) == pytest.approx(outside)
     assert dispensers.open_outside(0.08, [(0.0, 1.0)]) == 0.0
-    assert dispensers.open_unattended([(0.01, 1.0)], 0.08) == pytest.approx(0.07)
+    assert open_unattended(dispensers, [(0.01, 1.0)], 0.08) == pytest.approx(0.07)
     dispensers.forbid(0.03)
     assert dispensers.open_outside(0.08) == pytest.approx(max(outside, 0.05))
 

@@ -214,7 +214,7 @@ def test_cameras_of_another_program_scan_the_wound_that_they_show(tmp_path: Path
         done = subprocess.run([*PROGRAM, *map(str, order)], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0 and "cm² scanned from" in done.stdout, done.stdout + done.stderr
     assert "Traceback" not in done.stderr and (tmp_path / "scan.html").stat().st_size > 10_000
-    found, true = read_mesh(tmp_path / "scan.ply").scan, scan_from_triangles(*wound_scene().shape.mesh(0.5))
+    found, true = read_mesh(tmp_path / "scan.ply"), scan_from_triangles(*wound_scene().shape.mesh(0.5))
     place = register(found.vertices[:: len(found.vertices) // 800], 0.1, true, np.array([0.0, 0.0, 1.0]))
     points = se3.transform_points(se3.inverse(place.base_from_surface), found.vertices)
     off = np.linalg.norm(points - ScanIndex(true).closest(points).points, axis=1)

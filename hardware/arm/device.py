@@ -95,7 +95,6 @@ class ArmEvent:
     stamp: float  # s
     text: str
     state: ArmState | None = None  # the new state; None where it stayed
-    by_operator: bool = False
 
 
 def axes_text(axes: Array) -> str:
@@ -225,11 +224,6 @@ class ArmDevice:
         self._reopen_at = now + self.settings.reopen
         self._change(ArmState.UNPLUGGED, reason, now)
 
-    @property
-    def origin(self) -> Array:
-        """(3,) mm in machine axes, from which the arm counts."""
-        return self.driver.origin
-
     def _read(self, now: float) -> list[Reply]:
         """Take the answers that have come; gives those about the arm's origin."""
         reported = self.driver.state(now)
@@ -283,8 +277,7 @@ class ArmDevice:
 
     def _change(self, state: ArmState, reason: str, now: float) -> None:
         if (state, reason) != (self.state, self.reason):
-            by_operator = isinstance(reason, Reason) and reason.code is LinkCode.OPERATOR
-            self._events.append(ArmEvent(now, f"{state.value}: {reason}", state, by_operator))
+            self._events.append(ArmEvent(now, f"{state.value}: {reason}", state))
         self.state, self.reason = state, reason
 
     def _note(self, text: str, now: float) -> None:

@@ -125,10 +125,8 @@ class ArmFeedback:
 
     def axes(self, now: float) -> Array | None:
         """The answered axes (6,), mm and rad; None where they are older than `silence`."""
-        place, turn = self._place, self._turn
-        if place.values is None or turn.values is None or now - min(place.stamp, turn.stamp) > self.settings.silence:
-            return None
-        return np.concatenate([place.values, turn.values])
+        stale = now - min(self._place.stamp, self._turn.stamp) > self.settings.silence
+        return None if stale else self.last
 
     @property
     def last(self) -> Array | None:

@@ -270,8 +270,9 @@ class Arm(ArmDevice):
         return Reason(f"the arm is {self.state.value}: {self.reason}", LinkCode(self.state.value))
 
     def _check_origin(self, reply: Reply, now: float) -> None:
-        if np.abs(reply.values - self.origin).max() > ORIGIN_ROUNDING and self.state is ArmState.ARMED:
-            self.stop(f"the arm's origin is {reply.values.tolist()}, not {self.origin.tolist()}", now)
+        origin = self.driver.origin
+        if np.abs(reply.values - origin).max() > ORIGIN_ROUNDING and self.state is ArmState.ARMED:
+            self.stop(f"the arm's origin is {reply.values.tolist()}, not {origin.tolist()}", now)
 
     def _drop_unsent(self) -> None:
         """Drop own moves, and the frames of which no byte is on the wire."""

@@ -296,7 +296,6 @@ def _adapters() -> list[tuple[str, Identity]]:
     ]
 
 
-METHODS = ("GET", "POST", "PUT")
 HTTP_PORT = 80
 MAX_BODY = 4096  # bytes of an answer that are read
 

@@ -41,12 +41,15 @@ class QueuedCommand:
 
 
 class ArmQueue:
-    """The commands that the arm has yet to do, and its set-point; every frame that is sent is entered."""
+    """The commands that the arm has yet to do, and its set-point; every frame that is sent is entered.
+
+    wire_free: s, when all bytes given out so far are on the wire.
+    """
 
     def __init__(self, axes: Sequence[float], frame_time: float, now: float) -> None:
         """axes: (6,) where the arm stands. frame_time: s of one frame on the wire."""
         self._frame_time = frame_time
-        self._wire = now
+        self.wire_free = now
         self._commands: deque[QueuedCommand] = deque(maxlen=MAX_QUEUED_COMMANDS)
         self.stand(axes, now)
 
@@ -54,11 +57,6 @@ class ArmQueue:
     def target(self) -> Axes:
         """Where the last command ends."""
         return self._commands[-1].target
-
-    @property
-    def wire_free(self) -> float:
-        """When all bytes given out so far are on the wire, s."""
-        return self._wire
 
     def stand(self, axes: Sequence[float], now: float) -> None:
         """Nothing is queued, and the arm stands at `axes` (6,)."""
@@ -78,19 +76,19 @@ class ArmQueue:
         """The last byte of an instruction was given out at `now`, s. left: share of its frame that went just then."""
         duration, source = self.duration(instruction), self.target
         self.occupy(now, left)
-        start = max(self._wire, self._commands[-1].end)
+        start = max(self.wire_free, self._commands[-1].end)
         target = source if isinstance(instruction, G4) else tuple(float(a) for a in instruction.axes)
         self._commands.append(QueuedCommand(start, start + duration, source, target))
 
     def occupy(self, now: float, share: float) -> None:
         """A share of a frame's bytes was given out at `now`, s."""
-        self._wire = max(self._wire, now) + share * self._frame_time
+        self.wire_free = max(self.wire_free, now) + share * self._frame_time
 
     def stop(self) -> None:
         """A frame that stops the arm was given out: the arm rests where the set-point is when that arrives."""
-        if self._commands[-1].end <= self._wire:
+        if self._commands[-1].end <= self.wire_free:
             return  # it rests already
-        arrival, place = self._wire, self.at(self._wire)
+        arrival, place = self.wire_free, self.at(self.wire_free)
         while self._commands and self._commands[-1].end > arrival:
             command = self._commands.pop()
             if command.start < arrival:
@@ -99,11 +97,11 @@ class ArmQueue:
 
     def in_flight(self, now: float) -> float:
         """Seconds until all that was given out is done."""
-        return max(self._commands[-1].end - now, self._wire - now, 0.0)
+        return max(self._commands[-1].end - now, self.wire_free - now, 0.0)
 
     def in_flight_with(self, duration: float, now: float) -> float:
         """The same if a command of `duration` s were given out at `now`."""
-        return max(max(self._wire, now) + self._frame_time, self._commands[-1].end) + duration - now
+        return max(max(self.wire_free, now) + self._frame_time, self._commands[-1].end) + duration - now
 
     def idle(self, since: float, until: float) -> float:
         """Seconds between two instants, s, no more than a second ago, in which no command is being done."""

@@ -218,9 +218,9 @@ def _nees(seed: int) -> float:
 REST_AFTER = 0.25  # s after which an arm rests
 
 
-def set_point_of(targets: Array, tick: float, begin: float = 0.0) -> SetPoint:
-    """Where targets (K, 6), a tick apart, send an arm that stands at the first of them at `begin`, s."""
-    return SetPoint(begin + tick * np.arange(len(targets), dtype=np.float64), np.ascontiguousarray(targets, float))
+def set_point_of(targets: Array, tick: float) -> SetPoint:
+    """Where targets (K, 6), a tick apart, send an arm that stands at the first of them at 0 s."""
+    return SetPoint(tick * np.arange(len(targets), dtype=np.float64), np.ascontiguousarray(targets, float))
 
 
 def sightings_of(

@@ -200,16 +200,6 @@ def append_rows(file: Path, columns: Sequence[str], rows: Iterable[Sequence[obje
         csv.writer(stream).writerows([columns, *rows] if new else rows)
 
 
-def log_rows(file: Path, columns: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and cells of each row that `append_rows` wrote; InputError where the file has another header."""
-    with file.open(newline="", encoding="utf-8") as stream:
-        table = csv.DictReader(stream)
-        if tuple(table.fieldnames or ()) != tuple(columns):
-            raise InputError(file, "header", table.fieldnames, ",".join(columns))
-        for row in table:
-            yield table.line_num, row
-
-
 def require_positive(options: argparse.Namespace, *names: str) -> None:
     """InputError where an option is less than 1."""
     for name in names:

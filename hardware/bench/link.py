@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -93,10 +92,8 @@ def run_link(options: argparse.Namespace) -> list[Figure]:
     machine = f"{priority}; load {load:.1f} on {os.cpu_count()} cores, {busy} processes burn"
     stops, orders = calm.stops + halted.stops + rough.stops, calm.orders + rough.orders
     note = f"{halted.halts} halts up to 600 ms, {len(halted.arms) - 1} returns of the device"
-    stop_name, moving = (
-        f"{name}: stop on the wire after its decision, 99 %",
-        sum(p.arms[-1].left > 0 for p in parts[:2]),
-    )
+    stop_name = f"{name}: stop on the wire after its decision, 99 %"
+    moving = sum(p.arms[-1].left > 0 for p in parts[:2])
     return [
         Figure(f"{name}: ticks a second", calm.rate, "Hz", at_least(49.5), "thesis 30", machine),
         Figure(f"{name}: tick late, median", 1000 * lateness.median, "ms"),
@@ -248,27 +245,18 @@ class _Operator:
 
 
 @contextmanager
-def _running(*processes: BaseProcess) -> Iterator[None]:
+def burning(count: int) -> Iterator[None]:
+    """So many processes that want a core each, of ordinary priority, as another user's."""
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=_burn, daemon=True) for _ in range(count)]
     for process in processes:
         process.start()
     try:
         yield
     finally:
-        _kill(*processes)
-
-
-def _kill(*processes: BaseProcess) -> None:
-    for process in processes:
-        process.kill()
-        process.join()
-
-
-@contextmanager
-def burning(count: int) -> Iterator[None]:
-    """So many processes that want a core each, of ordinary priority, as another user's."""
-    context = multiprocessing.get_context("spawn")
-    with _running(*(context.Process(target=_burn, daemon=True) for _ in range(count))):
-        yield
+        for process in processes:
+            process.kill()
+            process.join()
 
 
 def _burn() -> None:

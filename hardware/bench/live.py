@@ -301,16 +301,9 @@ def _stop_figures(options: argparse.Namespace, folder: Path, path: Path) -> list
     finally:
         run.close()
     delay = json.loads(RunFiles(record).summary.read_text(encoding="utf-8"))["latency_ms"].get(STOP_STAGE, {})
-    note = f"{delay.get('count', 0)} stops by the terminal"
+    target, note = at_most(STOP_TARGETS[options.busy > 0]), f"{delay.get('count', 0)} stops by the terminal"
     return [
-        Figure(
-            "stop decided to on the wire, 99 %",
-            _ms(delay, "p99"),
-            "ms",
-            at_most(STOP_TARGETS[options.busy > 0]),
-            "",
-            note,
-        ),
+        Figure("stop decided to on the wire, 99 %", _ms(delay, "p99"), "ms", target, note=note),
         Figure("stop decided to on the wire, largest", _ms(delay, "max"), "ms"),
     ]
 

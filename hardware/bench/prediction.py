@@ -11,7 +11,7 @@ squared errors over the last seconds, relative to the best one's.
 motion of a live run and the virtual arm, whose nozzle is compared with its true checkpoint every millisecond. Only the
 pose that the motion is given differs: the first one for ever, the last one at rest, the last one with its velocity, or
 the pose as it is. The first three state no error: only the arm's limits keep them from printing. One more scenario has
-a late dispenser: hardware/bench/fault_run.py.
+a late dispenser: hardware/bench/loop_run.py.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from estimation.forecast.predictor import Predictor
 from estimation.pose import SurfacePose, TrackState, Trajectory
 from estimation.se3 import Array
 from hardware.bench import figures
-from hardware.bench.fault_run import (
+from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
+from hardware.bench.loop_run import (
     DELAYS_KNOWN,
     DELAYS_ZERO,
     LATE_DISPENSER,
     BeadsPrint,
-    FaultRun,
+    LoopRun,
     bead_figures,
     prepare_scenario,
     print_beads,
 )
-from hardware.bench.figures import Figure, Target, at_least, at_most, columns, with_progress, workers
 from hardware.bench.subjects import BREATHING
 from hardware.files.folder_tables import read_tum
 from hardware.process.clock import CpuClock
@@ -177,10 +177,8 @@ def errors_of(chest: Chest, warm_up: float) -> TraceErrors:
     """Run every method over one trace, once through."""
     trace, points = chest.observed, chest.points
     step = float(np.median(np.diff(trace.stamps)))
-    first, ahead = (
-        int(np.searchsorted(trace.stamps, trace.stamps[0] + warm_up)),
-        tuple(round(a / step) for a in PREDICTION_HORIZONS),
-    )
+    first = int(np.searchsorted(trace.stamps, trace.stamps[0] + warm_up))
+    ahead = tuple(round(a / step) for a in PREDICTION_HORIZONS)
     places = se3.transform_points(trace.base_from_surface, points)  # (T, P, 3)
     flat = places.reshape(len(places), -1)
     plain = places + plain_forecasts(flat, step, ahead).reshape(len(ahead), *places.shape)
@@ -203,10 +201,8 @@ def _predicted(trace: Trajectory, points: Array) -> tuple[Array, Array, Array]:
     twists = np.zeros((count, 6))
     moves = se3.log(se3.inverse(trace.base_from_surface[:-1]) @ trace.base_from_surface[1:])
     twists[1:] = moves / np.diff(trace.stamps)[:, None]
-    places, radii = (
-        np.zeros((len(PREDICTION_HORIZONS), count, len(points), 3)),
-        np.zeros((len(PREDICTION_HORIZONS), count, len(points))),
-    )
+    places = np.zeros((len(PREDICTION_HORIZONS), count, len(points), 3))
+    radii = np.zeros(places.shape[:3])
     ms, covariance = np.zeros(count), TRACE_VARIANCE * np.eye(6)
     for i, stamp in enumerate(trace.stamps.tolist()):
         start = clock.now()
@@ -250,10 +246,9 @@ def prediction_figures(traces: list[TraceErrors], shares: Sequence[float | None]
             name = f"{trace.name}, {1000 * ahead:.0f} ms: inside 90 %"
             rows.append(Figure(name, float(trace.covered[k]), "", COVERED_TARGET, "", note))
     ms = np.concatenate([t.ms for t in traces])
-    rows.append(
-        Figure("time a step: median", figures.percentile(ms, 50), "ms", at_most(0.5), "", "CPU, learning included")
-    )
-    return [*rows, Figure("time a step: p99", figures.percentile(ms, 99), "ms", None, "", "CPU")]
+    note = "CPU, learning included"
+    rows.append(Figure("time a step: median", figures.percentile(ms, 50), "ms", at_most(0.5), note=note))
+    return [*rows, Figure("time a step: p99", figures.percentile(ms, 99), "ms", note="CPU")]
 
 
 MIN_DRAWN_MM = 0.01  # where the logarithmic axis begins
@@ -329,8 +324,7 @@ def run_loop(options: argparse.Namespace) -> list[Figure]:
 
 def _print_case(seed: int, scenario: str, way: str) -> Print:
     prepared = prepare_scenario(shipped_file("scenarios", f"{scenario}.toml"))
-    log = FaultRun(prepared, (), seed, change=MOTION_INPUTS[way]())().log
-    assert log is not None
+    log = LoopRun(prepared, seed, change=MOTION_INPUTS[way]())()
     error = np.linalg.norm((log.base_from_nozzle - log.base_from_target)[:, :3, 3], axis=1)
     return Print(log.stamps, np.where(log.extrude, error, np.nan))
 

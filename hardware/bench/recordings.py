@@ -266,24 +266,15 @@ def beside_figures(
     for word, share in (("median", 50), ("99 %", 99)):
         plain_ms, loaded_ms, handover_ms = (milliseconds(seconds[tracked], share) for seconds in spent)
         figures += [
-            Figure(
-                f"{name}: pose after, without the network, {word}", plain_ms, "ms", None, "", f"{tracked.sum()} each"
-            ),
+            Figure(f"{name}: pose after, without the network, {word}", plain_ms, "ms", note=f"{tracked.sum()} each"),
             Figure(f"{name}: pose after, with it, {word}", loaded_ms, "ms"),
             Figure(f"{name}: with / without, {word}", loaded_ms / plain_ms, "times"),
             Figure(f"{name}: pictures handed over, after the pose, {word}", handover_ms, "ms"),
         ]
-    late_counts = [int((seconds[tracked] > 1 / FRAME_RATE).sum()) for seconds in spent[:2]]
+    late_without, late_with = (int((seconds[tracked] > 1 / FRAME_RATE).sum()) for seconds in spent[:2])
     return [
         *figures,
-        Figure(
-            f"{name}: poses later than the next pictures",
-            late_counts[1],
-            "",
-            None,
-            "",
-            f"without the network {late_counts[0]}",
-        ),
+        Figure(f"{name}: poses later than the next pictures", late_with, note=f"without the network {late_without}"),
         Figure(f"{name}: poses lost with the network alone", lost_count, "", at_most(0), "", f"of {len(pairs)}"),
         Figure(f"{name}: poses that differ in a bit", different_count, "", at_most(0), "", f"of {len(pairs)}"),
     ]

@@ -325,7 +325,7 @@ def _segmenter(a: argparse.Namespace) -> Segmenter:
         return NetworkSegmenter(network, network.settings)
     pattern, area = None, None
     if a.scan is not None:
-        pattern, outline_area = scan_outline(read_mesh(a.scan).scan)
+        pattern, outline_area = scan_outline(read_mesh(a.scan))
         area = None if a.mm_per_px is None else outline_area / a.mm_per_px**2
     return ShapeSegmenter(read_shape_model(shipped_model("shape", ".toml")), pattern, area)
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from estimation.errors import InputError
 from estimation.se3 import Array
+from hardware.process import checks
 from hardware.process.clock import Clock
 from planning.command import MAX_FLOW
 from planning.material import bead_areas, is_metered
@@ -70,29 +71,25 @@ class DispenserProfile:
         if not self.materials:
             raise InputError("dispenser", "materials", list(self.materials), "one name or more")
         for name in ("on_dead_time", "on_lag", "off_dead_time", "off_lag"):
-            self._check(name, getattr(self, name), 0.0, MAX_DISPENSER_DELAY, "s")
+            checks.within(0.0, MAX_DISPENSER_DELAY, "s")("dispenser", name, getattr(self, name))
         if self.nozzle_offset.shape != (3,) or not (np.abs(self.nozzle_offset) <= MAX_NOZZLE_OFFSET).all():
             allowed = f"3 numbers X Y Z, within {MAX_NOZZLE_OFFSET:g} mm"
             raise InputError("dispenser", "nozzle_offset", self.nozzle_offset.tolist(), allowed)
         if self.watchdog is not None:
-            self._check("watchdog", self.watchdog, 0.02, 60.0, "s")
+            checks.within(0.02, 60.0, "s")("dispenser", "watchdog", self.watchdog)
         low, high = self.flow_range
         if not 0 < low < high <= MAX_FLOW:
             raise InputError("dispenser", "flow_range", [low, high], f"0 < low < high <= {MAX_FLOW:g} mm^3/s")
-        self._check("flow", self.flow, 1e-6, MAX_FLOW, "mm^3/s")
+        checks.within(1e-6, MAX_FLOW, "mm^3/s")("dispenser", "flow", self.flow)
         for number in (*(self.temperature_range or ()), *(() if self.kept_at is None else (self.kept_at,))):
             name = "kept_at" if self.temperature_range is None else "temperature_range"
-            self._check(name, number, MIN_TEMPERATURE, MAX_TEMPERATURE, "degrees C")
+            checks.within(MIN_TEMPERATURE, MAX_TEMPERATURE, "degrees C")("dispenser", name, number)
         if self.temperature_range is not None and not self.temperature_range[0] < self.temperature_range[1]:
             raise InputError("dispenser", "temperature_range", list(self.temperature_range), "low < high, degrees C")
         if self.temperature_range is not None and self.kept_at is not None:
             raise InputError("dispenser", "kept_at", self.kept_at, "left out where temperature_range is given")
         for name in ("prime_volume", "retract_volume"):
-            self._check(name, getattr(self, name), 0.0, MAX_DRAWN_BACK, "mm^3")
-
-    def _check(self, name: str, value: float, low: float, high: float, unit: str) -> None:
-        if not low <= value <= high:  # NaN fails as well
-            raise InputError("dispenser", name, value, f"{low:g} to {high:g} {unit}")
+            checks.within(0.0, MAX_DRAWN_BACK, "mm^3")("dispenser", name, getattr(self, name))
 
     @property
     def on_delay(self) -> float:

@@ -25,7 +25,7 @@ from hardware.arm.port import Port
 
 HEX = "hex:"
 PATTERNS = ("answer", "alarm")  # of DispenserMessages: regular expressions, not templates
-_SECONDS, _MINUTES, _HOURS = 1.0, 60.0, 3600.0
+_MINUTES, _HOURS = 60.0, 3600.0
 
 
 @dataclass(frozen=True, slots=True)

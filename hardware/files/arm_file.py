@@ -340,7 +340,7 @@ def tool_body_of(profile: ArmProfile, margin: float = BASE_MARGIN, touch: float 
 
 def _mesh_triangles(file: str) -> Array:
     """Triangles (T, 3, 3), mm, of a part's mesh."""
-    return read_mesh(file).scan.corners
+    return read_mesh(file).corners
 
 
 def _limit(name: str) -> checks.Check:

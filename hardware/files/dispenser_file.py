@@ -1,32 +1,7 @@
-"""Dispenser files: one or several `[[dispenser]]` tables; keys that a file leaves out have their preset's values.
+"""Dispenser files: one or several `[[dispenser]]` tables, in mm, s and degrees C; docs/dispenser.md lists their keys.
 
-[[dispenser]]
-name = "syringe"
-materials = ["gel", 1]           # as the path's column `material` names them; a material is in one dispenser
-preset = "arduino"               # one of PRESETS; arm_pwm: the arm's own frames switch it; arm_axis: its axis E pushes
-port = "/dev/ttyACM0"            # a device's path, a URL of pyserial's, or http://HOST:PORT
-baud = 115200
-on_dead_time_s = 0.03            # from the line taking the message until material begins to flow
-on_lag_s = 0.02                  # time constant of its rise
-off_dead_time_s = 0.02
-off_lag_s = 0.05
-nozzle_offset_mm = [0, 0, 0]     # its tip in the tool's nozzle frame
-watchdog_s = 0.1                 # after which the device switches itself off; 0: it never does
-keepalive_s = 0.04               # at most two fifths of the watchdog
-start_s = 2.0                    # after opening, in which the device takes in nothing but an off
-gap_s = 0.0                      # between two lines
-timeout_s = 0.05                 # twice that without progress is a failed line; of an HTTP request once
-metered = false                  # whether the device gives the flow that it is told
-flow_range_mm3_s = [0.1, 20]     # of a metered one
-flow_mm3_s = 1.0                 # that an unmetered one gives
-temperature_range_c = [4, 60]    # that it can set
-kept_at_c = 22                   # or: at which something else keeps it
-prime_mm3 = 0.0                  # pushed before on, where it was drawn back before
-retract_mm3 = 0.0                # drawn back after off
-plunger_mm2 = 78.5               # cross-section of what pushes, for messages in mm; needed by arm_axis
-pwm_on, pwm_off = 2000, 0        # of arm_pwm: bytes 27 to 30 of a G1 frame (a key each)
-[dispenser.messages]             # instead of the preset's, see hardware/dispenser/messages.py
-on = "ON {flow_ul_s}"
+Keys that a file leaves out have their preset's values. A preset is one of PRESETS, or says that the arm itself does it:
+arm_pwm, whose frames switch it, or arm_axis, whose axis E pushes.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ import glob
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TextIO
 
@@ -109,6 +109,20 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     return [(i, line) for i, line in numbered if line and not line.startswith("#")]
 
 
+@contextmanager
+def csv_table(file: Path, columns: Sequence[str]) -> Iterator[Callable[[Iterable[object]], None]]:
+    """Gives what writes a row of a new CSV file, below its header; each row is in the file when the call returns."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+
+        def write(row: Iterable[object]) -> None:
+            table.writerow(row)
+            stream.flush()
+
+        write(columns)
+        yield write
+
+
 FRAME_COLUMNS = ("camera", "frame", "stamp_s")
 HEAD_COLUMNS = ("stamp_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "extruding")
 
@@ -117,8 +131,8 @@ def read_frames(path: Path, rig: Rig) -> list[Array]:
     """Stamps (N,), s, of each camera's frames 0..N-1 as its own clock gave them: finite, rising, none left out."""
     names = [c.name for c in rig.cameras]
     numbered: list[dict[int, float]] = [{} for _ in names]
-    for line, row in _rows(path, FRAME_COLUMNS):
-        camera, frame, stamp = _frame_row(path, line, row, names)
+    for line, cells in _rows(path, FRAME_COLUMNS):
+        camera, frame, stamp = _frame_row(path, line, cells, names)
         if frame in numbered[camera]:
             raise InputError(path, f"line {line}: camera,frame", f"{names[camera]},{frame}", "each frame once")
         numbered[camera][frame] = stamp
@@ -128,27 +142,19 @@ def read_frames(path: Path, rig: Rig) -> list[Array]:
     return stamps
 
 
-def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, dict[str, str | None]]]:
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = header
-            rows = [(reader.reader.line_num, row) for row in reader]  # its own count stays at a blank line
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", checks.error_text(error), "a readable CSV file") from error
+def _rows(path: Path, columns: Sequence[str]) -> list[tuple[int, list[str]]]:
+    """Line number and the cells of these columns of each row; what a short row lacks is empty."""
+    (_, first), *body = checks.read_csv(path) or [(1, [])]
+    header = [name.strip() for name in first]
     for column in columns:
         if column not in header:
             raise InputError(path, "header", ",".join(header) or "empty", ",".join(columns))
-    return rows
+    by_name = ((line, dict(zip(header, cells, strict=False))) for line, cells in body if cells)
+    return [(line, [row.get(column, "").strip() for column in columns]) for line, row in by_name]
 
 
-def _cells(row: dict[str, str | None], columns: Sequence[str]) -> list[str]:
-    return [(row[column] or "").strip() for column in columns]
-
-
-def _frame_row(path: Path, line: int, row: dict[str, str | None], names: Sequence[str]) -> tuple[int, int, float]:
-    name, frame, stamp = _cells(row, FRAME_COLUMNS)
+def _frame_row(path: Path, line: int, cells: list[str], names: Sequence[str]) -> tuple[int, int, float]:
+    name, frame, stamp = cells
     if name not in names:
         raise InputError(path, f"line {line}: camera", name, f"a camera of rig.toml, {checks.one_of_text(name, names)}")
     if not (frame.isascii() and frame.isdigit() and len(frame) < 10):
@@ -189,7 +195,7 @@ def frame_line(rig: Rig, ref: FrameRef) -> str:
 
 def read_heads(path: Path) -> PrintHeadLog:
     """The print heads of head.csv, base_from_nozzle; none is allowed, as where a run ended before the arm moved."""
-    table = [(f"line {line}", _cells(row, HEAD_COLUMNS)) for line, row in _rows(path, HEAD_COLUMNS)]
+    table = [(f"line {line}", cells) for line, cells in _rows(path, HEAD_COLUMNS)]
     rows = checked_rows(path, ((line, row_from_words(path, line, cells[:-1])) for line, cells in table))
     for line, cells in table:
         if cells[-1] not in ("0", "1"):

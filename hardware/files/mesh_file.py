@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.errors import InputError
-from estimation.scans.scan import Scan, open_edges, scan_from_triangles
+from estimation.scans.scan import Scan, scan_from_triangles
 from estimation.se3 import Array
 from hardware.files.mesh_reader import (
     PLAIN_READERS,
@@ -254,14 +254,6 @@ MIN_SCAN_SIZE, MAX_SCAN_SIZE = 1.0, 2000.0  # mm, longest side: a hand in metres
 WHOLE_MESH = "a whole file of a mesh with triangles, or of a cloud of points"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeshFile:
-    """A scan, and how far from closed it is."""
-
-    scan: Scan
-    open_edges: int  # edges with one triangle only, of the rim and of holes; 0 if closed
-
-
 def read_raw_mesh(path: str | Path, reader: MeshReader | None = None) -> RawMesh:
     """The mesh in a file, or the surface through its points, checked only for being whole.
 
@@ -311,7 +303,7 @@ def _read_in_process(path: Path, announcement: Announcement, reader_process: Mes
     return RawMesh(arrays["vertices"], arrays["triangles"], arrays.get("colours"))
 
 
-def read_mesh(path: str | Path, reader: MeshReader | None = None) -> MeshFile:
+def read_mesh(path: str | Path, reader: MeshReader | None = None) -> Scan:
     """Read and check a scan, mm; InputError says what is wrong with the file. reader: see `read_raw_mesh`."""
     path = Path(path)
     raw = read_raw_mesh(path, reader)
@@ -326,7 +318,7 @@ def read_mesh(path: str | Path, reader: MeshReader | None = None) -> MeshFile:
     scan = scan_from_triangles(vertices, triangles)
     if not len(scan.triangles):
         raise InputError(path, "scan", f"{len(triangles)} triangles, all of them without area", WHOLE_MESH)
-    return MeshFile(scan, len(open_edges(scan)))
+    return scan
 
 
 def _check_size(path: Path, vertices: Array) -> None:

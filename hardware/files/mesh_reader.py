@@ -266,9 +266,9 @@ def _thinned(cloud: Any) -> Any:
     return cloud.voxel_down_sample(side)
 
 
-def text_rows(file: BinaryIO, path: Path, first: int = 1) -> Iterator[tuple[int, list[bytes]]]:
-    """The number and the tokens of each line that is not empty. first: number of the next line of the file."""
-    for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES), b""), first):
+def text_rows(file: BinaryIO, path: Path) -> Iterator[tuple[int, list[bytes]]]:
+    """The number and the tokens of each line that is not empty."""
+    for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES), b""), 1):
         if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
             raise InputError(path, f"line {number}", f"{MAX_LINE_BYTES} bytes or more", f"fewer than {MAX_LINE_BYTES}")
         tokens = line.split()

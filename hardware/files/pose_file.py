@@ -8,7 +8,6 @@ camera, the cameras' clocks, milliseconds per stage, reason. Every line is flush
 
 from __future__ import annotations
 
-import csv
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +24,7 @@ from estimation.errors import InputError
 from estimation.pose import SurfacePose, TrackState
 from estimation.rig import Rig
 from estimation.se3 import Array
+from hardware.files.folder_tables import csv_table
 from hardware.process import checks
 from perception.frames import FrameSet
 
@@ -89,15 +89,13 @@ class PoseWriter(ExitStack):
 
     def __init__(self, folder: Path, cameras: Sequence[str], stages: Sequence[str]) -> None:
         super().__init__()
-        self._csv_file = self.enter_context((folder / "poses.csv").open("w", newline="", encoding="utf-8"))
-        self._tum_file = self.enter_context((folder / "poses.tum").open("w", encoding="utf-8"))
-        self._csv = csv.writer(self._csv_file, lineterminator="\n")
         of_cameras = [*(f"tracks_{name}" for name in cameras), *_clock_names(cameras)]
         of_stages = [f"ms_{stage}" for stage in (*stages, "total")]
-        self._csv.writerow([*_POSE_TABLE_COLUMNS, *of_cameras, *of_stages, "reason"])
+        table_columns = [*_POSE_TABLE_COLUMNS, *of_cameras, *of_stages, "reason"]
+        self._write_row = self.enter_context(csv_table(folder / "poses.csv", table_columns))
+        self._tum_file = self.enter_context((folder / "poses.tum").open("w", encoding="utf-8"))
         self._tum_file.write("# base_from_surface: stamp_s x y z qx qy qz qw (mm)\n")
-        for file in (self._csv_file, self._tum_file):
-            file.flush()  # a run that is cut short before its first pose is read back, too
+        self._tum_file.flush()  # a run that is cut short before its first pose is read back, too
 
     def write(self, pose: SurfacePose, frames: int, report: StepReport, total: float) -> None:
         """Write one frame set. frames: number of its images. total: s that the whole step took."""
@@ -112,8 +110,7 @@ class PoseWriter(ExitStack):
         times = [f"{v:.4f}" for v in (*in_ms, *(1000 * s for s in (*report.seconds, total)))]
         state = [pose.state.value, int(np.count_nonzero(tracks)), *tracks]
         row = [f"{pose.stamp:.6f}", frames, *transform, *covariance_and_twist, *motion, *state, *times, pose.reason]
-        self._csv.writerow(row)
-        self._csv_file.flush()
+        self._write_row(row)
         if pose.state.measured:
             self._tum_file.write(f"{pose.stamp:.6f} {' '.join(transform)}\n")
             self._tum_file.flush()
@@ -216,10 +213,8 @@ class WoundFile(ExitStack):
         self._rig, thread = rig, ThreadPoolExecutor(1)
         self._segmentation = AsyncSegmentation(rig, segmenter, thread)
         self._poses: deque[SurfacePose] = deque(maxlen=SEGMENTATION_DELAY_SETS + 1)
-        self._stream = self.enter_context((folder / WOUND_FILE_NAME).open("w", newline="", encoding="utf-8"))
+        self._write_row = self.enter_context(csv_table(folder / WOUND_FILE_NAME, WOUND_COLUMNS))
         self.callback(thread.shutdown, cancel_futures=True)
-        self._table = csv.writer(self._stream, lineterminator="\n")
-        self._table.writerow(WOUND_COLUMNS)
 
     def write(self, frames: FrameSet, pose: SurfacePose, report: StepReport) -> None:
         """One frame set and its pose; writes rows of earlier pictures once their segmentation is done."""
@@ -230,8 +225,7 @@ class WoundFile(ExitStack):
         stamp, estimates = done
         measured = next((p for p in self._poses if p.stamp == stamp and p.state.measured), None)
         for camera, estimate in estimates.items():
-            self._table.writerow(self._row(stamp, camera, estimate, measured))
-        self._stream.flush()
+            self._write_row(self._row(stamp, camera, estimate, measured))
 
     def _row(self, stamp: float, camera: int, wound: WoundEstimate, pose: SurfacePose | None) -> list[str | int]:
         from perception.wound.segmentation import area_on_plane

@@ -64,7 +64,7 @@ def guarded_tissue(scan: File, path: Path, profile: ArmProfile) -> TissueGuard:
 
     body = tool_body_of(profile, margin=0.0, touch=GUARD_TOUCH)
     try:
-        return tissue_guard(read_mesh(scan).scan, path, body)
+        return tissue_guard(read_mesh(scan), path, body)
     except InputError as error:
         raise InputError(scan, error.what, error.got, error.allowed) if error.where == "scan" else error from None
 

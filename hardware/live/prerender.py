@@ -48,7 +48,7 @@ from hardware.simulator.scenario import Scenario, read_scenario
 from hardware.simulator.scenario_tables import scene_from_table
 from hardware.simulator.simulate import regions
 from hardware.simulator.truth import Truth, TruthLog, drape_path, row_instants
-from hardware.simulator.world import SimulatedWorld
+from hardware.simulator.world import SimulatedWorld, WorldSink
 from perception.frames import FrameSet
 from perception.tracking.step import StepReport, report_without_offsets
 from planning.path import PrintPhase
@@ -126,7 +126,7 @@ class _NullTracker:
         """Nothing to do."""
 
 
-class _PictureSink:
+class _PictureSink(WorldSink):
     """Records pictures and the truth at their exposures; of all else that happens, nothing."""
 
     def __init__(self, recorder: Recorder, truth: Truth) -> None:
@@ -144,11 +144,6 @@ class _PictureSink:
         trajectory = Trajectory(stamps, self._truth.base_from_surface(stamps), exact=True)
         for row in rows_from_trajectory(trajectory):
             self._recorder.truth_row(row, exact=True)
-
-    def _ignore(self, *arguments: object, **named: object) -> None:
-        pass
-
-    pose = pose_delivery = tick = wire = head = rows = registration = look = event = _ignore
 
 
 BLOCK_SECONDS = 10.0  # s of rows compared at once

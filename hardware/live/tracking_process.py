@@ -153,7 +153,7 @@ class _TrackingLoop:
         if self._earlier is None and region.by is not None:
             rois = region.rois(rig, self.report.stamp)
         sender.put(rig)
-        self._scan = None if self._surface is None else read_mesh(self._surface).scan
+        self._scan = None if self._surface is None else read_mesh(self._surface)
         if self._surface is not None and self._scan is not None:
             sender.put(ScanEntry(self._surface))
             shared.link.scan.put(scan_drawing(self._scan))

@@ -7,7 +7,6 @@ calibrated mm.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +19,6 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.offline.trajectory_files import PoseSeries, read_pose_series, read_truth_series
 from hardware.process.progress import prepare_out
-from hardware.process.system import provenance
 from hardware.report.evaluation import (
     NEES_BOUND,
     PoseErrors,
@@ -29,12 +27,12 @@ from hardware.report.evaluation import (
     consistency_text,
     errors_under,
     figure,
-    finite,
     fixed_row,
     percent,
+    write_summary,
 )
-from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
-from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components
+from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.report import COMPONENTS_TEXT, PAGE_CHART_WIDTH, component_plots, components
 
 ALIGNMENTS = ("as they stand", "aligned, SE(3)", "one surface frame", "laid at one pose")  # keys of compare.json
 ALIGNMENT_LABELS = dict(
@@ -281,18 +279,10 @@ def _tiles(comparison: TrajectoryComparison) -> str:
 def _trajectory(comparison: TrajectoryComparison) -> str:
     fitted = comparison.fitted
     values, expected = (components(poses, fitted.reference[0]) for poses in (fitted.estimated, fitted.reference))
-    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
-    plots = []
-    for i in (0, 3, 1, 4, 2, 5):
-        scale = spanning([values[:, i], expected[:, i]], 0.12, 0.5)
-        plot = Plot(HALF_CHART_WIDTH, 165, comparison.span, scale, label=names[i])
-        plot.line(comparison.stamps, expected[:, i], "truth")
-        plot.line(comparison.stamps, values[:, i], "estimate")
-        plots.append(plot.svg())
+    plots = component_plots(comparison.span, comparison.stamps, {"truth": expected, "estimate": values})
     sources = ("estimate", comparison.estimated), ("truth", comparison.reference)
     keys = legend([line_key(style, _short(series.name)) for style, series in sources])
-    words = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
-    return section("Trajectories", words, f'{keys}<div class="two">{"".join(plots)}</div>')
+    return section("Trajectories", COMPONENTS_TEXT, keys + plots)
 
 
 def _absolute(comparison: TrajectoryComparison) -> str:
@@ -377,7 +367,6 @@ def run_compare(estimated: str, reference: str | None, delta: int, out: Path | N
     if (out / "summary.json").exists():
         raise InputError(out, "--out", "with another command's report", "a new folder, or one of stillbed compare")
     prepare_out(out, force=True)
-    figures = json.dumps(finite(comparison_figures(comparison) | {"provenance": provenance().table()}), indent=2)
-    (out / "compare.json").write_text(figures + "\n", encoding="utf-8")
+    write_summary(out / "compare.json", comparison_figures(comparison))
     (out / "report.html").write_text(comparison_page(comparison), encoding="utf-8")
     return f"{report}\nreport: {out / 'report.html'}"

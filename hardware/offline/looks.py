@@ -251,12 +251,11 @@ class LiveLooks:
             return None
         text = f"looked at: nothing could be judged, and the path goes on as planned ({type(error).__name__}: {error})"
         self.text = NOTHING_JUDGED if error is None else text
-        self.count, look = self.count + 1, self._looks.last
-        if look is None:
-            return None
+        self.count += 1
         if self._adapt is not None and (shares := self._looks.adapted()) is not None:
             self._adapt(shares)
-            look = replace(look, flow=shares)
+        if (look := self._looks.last) is None:
+            return None
         self.text = f"looked at: {look.text}"
         return replace(look, stamp=now, seconds=look.seconds + now - look.stamp)
 
@@ -318,7 +317,8 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
         volume, planned, _ = look.laid.total
         laid, crest = look.laid, look.laid.stations.crest
         off = laid.height[np.isfinite(laid.height)] - crest[np.isfinite(laid.height)]
-        heights = [np.median(crest) + _median(off), np.median(crest), float(np.std(off)) if len(off) else math.nan]
+        middle, uneven = (np.median(off), np.std(off)) if len(off) else (math.nan, math.nan)
+        heights = np.median(crest) + middle, np.median(crest), uneven
         clogs = "; ".join(f"{a:.0f} to {b:.0f} mm" for a, b in laid.clogs) or "none"
         values = (f"{value:.2f}" if math.isfinite(value) else "–" for value in (volume, planned, *heights))
         counts = str(int(laid.gap.sum())), str(int(laid.blob.sum()))
@@ -336,10 +336,6 @@ def looks_section(looks: Sequence[Look], path: Path) -> str:
         "of a layer that took its flow from the one below is what it was told to lay."
     )
     return page.section("Looks at what was laid", text, table + f'<div class="pictures">{figures}</div>')
-
-
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else math.nan
 
 
 def station_places(look: Look, path: Path, count: int = STATION_POINTS) -> Array:

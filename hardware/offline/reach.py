@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path as File
@@ -14,6 +13,7 @@ from estimation.errors import InputError
 from estimation.se3 import Array
 from hardware.arm.profile import ARM_FROM_BENCH, ArmProfile, far_limits_text, unreached_limits_text
 from hardware.files.arm_file import read_arm, tool_body_of
+from hardware.files.folder_tables import csv_table
 from hardware.files.mesh_file import read_mesh
 from hardware.files.path_file import read_path, write_path
 from hardware.process.clock import WallClock
@@ -49,7 +49,7 @@ from planning.path import (
     spin_path,
     unturned_reach,
 )
-from planning.urdf import UrdfArm, UrdfKinematics, urdf_reach
+from planning.urdf import UrdfKinematics, urdf_reach
 
 PAGE_WIDTH_PX = 900
 WRITTEN = "path.csv", "reach.csv", "reach.html"
@@ -233,7 +233,7 @@ def _with_tissue(
     spun = replace(path, surface_from_nozzle=spin_path(path, reach.spin))
     try:
         body = tool_body_of(profile, BASE_MARGIN + question.amplitude_mm)
-        room, part = path_rooms(read_mesh(scan).scan, spun, body)
+        room, part = path_rooms(read_mesh(scan), spun, body)
     except InputError as error:
         raise InputError(scan, error.what, error.got, error.allowed) if error.where == "scan" else error from None
     short, worst = room < 0, int(room.argmin())
@@ -257,33 +257,31 @@ def with_feasible(path: Path, arm: File) -> tuple[Path, str]:
 
 def _evaluated(path: Path, arm: File, question: ReachQuestion) -> tuple[ArmModel, SurfaceMotion, Reach]:
     """The arm's model, the surface's motion, and the arm's reach along the path over that motion."""
+    profile, model = read_arm(arm), _arm_model(arm, question)
+    motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
+    place = _arm_from_surface(question, None if isinstance(model, JointModel) else profile)
+    if isinstance(model, SimpleArm):
+        reach = unturned_reach(model, profile.limits.speed[:3], place, path, motion)
+    elif isinstance(model, UrdfKinematics):
+        reach = urdf_reach(model, place, path, motion)
+    else:
+        spin = best_spin(model, place, path, motion) if question.spin else np.zeros(len(path))
+        reach = reach_at_spin(model, place, path, motion, spin)
+    return model, motion, _within(profile, place, path, motion, reach)
+
+
+def _arm_model(arm: File, question: ReachQuestion) -> ArmModel:
+    """The model of an arm's joints; the tool of one by a URDF file is not spun."""
     profile = read_arm(arm)
     if profile.arm.max_lean is not None:
-        motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
-        place = _arm_from_surface(question, profile)
-        reach = unturned_reach(profile.arm, profile.limits.speed[:3], place, path, motion)
-        return profile.arm, motion, _within(profile, place, path, motion, reach)
-    if profile.urdf is not None:
-        return _evaluated_by_urdf(profile, profile.urdf, path, question)
-    profile, model = read_jointed_arm(arm)
-    motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
-    place = _arm_from_surface(question)
-    spin = best_spin(model, place, path, motion) if question.spin else np.zeros(len(path))
-    return model, motion, _within(profile, place, path, motion, reach_at_spin(model, place, path, motion, spin))
-
-
-def _evaluated_by_urdf(
-    profile: ArmProfile, arm: UrdfArm, path: Path, question: ReachQuestion
-) -> tuple[UrdfKinematics, SurfaceMotion, Reach]:
-    """The same of an arm whose joints a URDF file describes; its tool is not spun."""
+        return profile.arm
+    if profile.urdf is None:
+        return read_jointed_arm(arm)[1]
     if question.spin:
         raise InputError("command line", "--spin", "given", "an arm of six joints with a table of them")
     if profile.flange_from_nozzle is None:
-        raise InputError(arm.file, "flange_from_nozzle", "missing", "a 4x4 matrix in the arm file, mm")
-    model = UrdfKinematics(arm, profile.flange_from_nozzle)
-    motion = SurfaceMotion(question.amplitude_mm, float(np.deg2rad(question.turn_deg)), question.rate_hz)
-    place = _arm_from_surface(question, profile)
-    return model, motion, _within(profile, place, path, motion, urdf_reach(model, place, path, motion))
+        raise InputError(profile.urdf.file, "flange_from_nozzle", "missing", "a 4x4 matrix in the arm file, mm")
+    return UrdfKinematics(profile.urdf, profile.flange_from_nozzle)
 
 
 def read_jointed_arm(arm: File) -> tuple[ArmProfile, JointModel]:
@@ -386,13 +384,11 @@ def _write(out: File, path: Path, reach: Reach) -> None:
     table = np.column_stack(
         [np.rad2deg(reach.joints), *angles, reach.shoulder, reach.manipulability, reach.speed, np.rad2deg(reach.spin)]
     )
-    with (out / "reach.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        more = (f"j{i}_deg" for i in range(7, reach.joints.shape[1] + 1))
-        writer.writerow([*REACH_COLUMNS[:9], *more, *REACH_COLUMNS[9:]])
+    more = (f"j{i}_deg" for i in range(7, reach.joints.shape[1] + 1))
+    with csv_table(out / "reach.csv", [*REACH_COLUMNS[:9], *more, *REACH_COLUMNS[9:]]) as write_row:
         for i, row in enumerate(table.tolist()):
             numbers = [f"{value:.4f}" if np.isfinite(value) else "" for value in row]
-            writer.writerow([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])
+            write_row([i, int(reach.feasible[i]), REACH_REASONS[reach.reason[i]], *numbers])
 
 
 def _smallest(values: Array, digits: int = 1) -> str:

@@ -7,7 +7,6 @@ are those of a live run; the arm is one that takes all and never answers, so the
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -25,6 +24,7 @@ from hardware.arm.port import Port
 from hardware.arm.profile import ArmProfile, placed
 from hardware.arm.s6h4d import S6H4D
 from hardware.files.arm_file import write_arm
+from hardware.files.folder_tables import csv_table
 from hardware.files.path_file import ProgressFile, read_path, read_progress
 from hardware.files.session import Session
 from hardware.motion.loop import MaterialControl, Order, Tick
@@ -212,15 +212,12 @@ class CommandWriter(ExitStack):
 
     def __init__(self, folder: File) -> None:
         super().__init__()
-        self._table = self.enter_context((folder / "commands.csv").open("w", newline="", encoding="utf-8"))
+        self._write_row = self.enter_context(csv_table(folder / "commands.csv", COMMAND_COLUMNS))
         self._frames = self.enter_context((folder / "frames.bin").open("wb"))
-        self._csv = csv.writer(self._table, lineterminator="\n")
-        self._csv.writerow(COMMAND_COLUMNS)
 
     def write(self, command: Command) -> None:
         """Write what one tick commanded."""
-        self._csv.writerow(_row(command))
-        self._table.flush()
+        self._write_row(_row(command))
 
     def send(self, data: bytes) -> None:
         """Write bytes that went to the arm."""

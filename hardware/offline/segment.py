@@ -5,9 +5,8 @@ Of a session, whose cameras are calibrated, also the wound's area in mm^2 with a
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from estimation.errors import InputError
+from hardware.files.folder_tables import csv_table
 from hardware.files.images import Video, decode, encode
 from hardware.files.session import Session
 from hardware.process.checks import read_bytes, read_csv
@@ -99,7 +99,7 @@ def run_segment(inputs: Sequence[Path], out: Path, segmenter: Segmenter, options
     clock, errors, lost = WallClock(), list[InputError](), list[str]()
     times, wounds = list[float](), 0  # times: ms of each picture
     with ExitStack() as stack:
-        write_row = stack.enter_context(_table(out / WOUND_TABLE, WOUND_COLUMNS))
+        write_row = stack.enter_context(csv_table(out / WOUND_TABLE, WOUND_COLUMNS))
         areas = stack.enter_context(AreaLog(out, segmenter, [file for file in files if _is_session(file)]))
         progress = stack.enter_context(Progress("segment", "pictures", clock.now))
         total = sum(expected_count(file) for file in files)
@@ -129,7 +129,7 @@ class AreaLog(ExitStack):
         self._banded = segmenter if isinstance(segmenter, NetworkSegmenter) else None
         self._areas: dict[Path, list[WoundArea | str]] = {path: [] for path in sessions}
         (folder / AREA_TABLE).unlink(missing_ok=True)  # of an earlier run
-        self._write = self.enter_context(_table(folder / AREA_TABLE, AREA_COLUMNS)) if sessions else None
+        self._write = self.enter_context(csv_table(folder / AREA_TABLE, AREA_COLUMNS)) if sessions else None
 
     def segmented(self, picture: NamedPicture) -> Segmentation:
         """The wound in a picture, kept for its area where that is measured."""
@@ -181,20 +181,6 @@ def area_row(instant: MeasuredSet, area: WoundArea | str) -> list[str]:
         return [*head, "", "", "", "", area]
     cameras = " ".join(instant.session.rig.cameras[c].name for c in area.cameras)
     return [*head, cameras, f"{area.area:.2f}", f"{area.low:.2f}", f"{area.high:.2f}", ""]
-
-
-@contextmanager
-def _table(file: Path, columns: Sequence[str]) -> Iterator[Callable[[Iterable[object]], None]]:
-    """Writes rows of a CSV file; each is in the file when the call returns."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        table = csv.writer(stream, lineterminator="\n")
-
-        def write(row: Iterable[object]) -> None:
-            table.writerow(row)
-            stream.flush()
-
-        write(columns)
-        yield write
 
 
 def input_files(inputs: Sequence[Path]) -> list[Path]:

@@ -8,7 +8,6 @@ summary last, so any worker can start it again. All workers must reach sessions 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import io
 import json
@@ -24,7 +23,7 @@ from estimation.batch.smooth import smooth
 from estimation.batch.smoothed import REFINED_PRIOR, CalibrationPrior, Smoothed
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
-from hardware.files.folder_tables import write_tum
+from hardware.files.folder_tables import csv_table, write_tum
 from hardware.files.rig_file import write_rig
 from hardware.files.session import Session, damage_text
 from hardware.offline.smooth_report import SmoothEvaluation, evaluate_smoothed, smooth_page, smooth_verdict
@@ -32,9 +31,9 @@ from hardware.offline.smooth_tracks import ReobservedTracks, SessionTracks, reob
 from hardware.offline.trajectory_files import write_copy, write_instants, write_map
 from hardware.process.clock import WallClock
 from hardware.process.progress import Progress, check_apart, prepare_out
-from hardware.process.system import file_hash, provenance
+from hardware.process.system import file_hash
 from hardware.recording.session_reader import open_session
-from hardware.report.evaluation import finite
+from hardware.report.evaluation import write_summary
 
 SUMMARY_FILE = "summary.json"
 LAST_PASS = "covariances"  # how many there are before it, nobody knows: each tells how far it is itself
@@ -80,8 +79,7 @@ def smooth_session(path: Path, out: Path, options: SmoothOptions, stream: TextIO
     text = f"{words}\nreport: {report}"
     report.write_text(smooth_page(session.path.name, words, result, evaluation), encoding="utf-8")
     summary = {"contents": contents, "text": text, **_figures(result, evaluation, session), **reobserved.figures}
-    summary["provenance"] = provenance().table()
-    (out / SUMMARY_FILE).write_text(json.dumps(finite(summary), indent=2) + "\n", encoding="utf-8")
+    write_summary(out / SUMMARY_FILE, summary)
     return False, text
 
 
@@ -315,16 +313,14 @@ def smooth_job(job: SmoothJob, options: SmoothOptions) -> SmoothOutcome:
 def write_table(path: Path, jobs: Iterable[SmoothJob], outcomes: Iterable[SmoothOutcome]) -> None:
     """sessions.csv: a line for each job, in their order; those without an outcome are "not done"."""
     known = {outcome.job: outcome for outcome in outcomes}
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["session", "state", "reason", "folder", "spent_s", *SUMMARY_FIGURES])
+    with csv_table(path, ["session", "state", "reason", "folder", "spent_s", *SUMMARY_FIGURES]) as write:
         for job in jobs:
             outcome = known.get(job, SmoothOutcome(job, "not done", "interrupted", 0.0))
             done = outcome.state in (SMOOTHED, ALREADY_DONE)
             figures = _summary(job.out) if done else {}
             reason = "" if done else " ".join(outcome.text.split())
             head = [str(job.session), outcome.state, reason, str(job.out), f"{outcome.spent:.1f}"]
-            writer.writerow([*head, *("" if figures.get(key) is None else figures[key] for key in SUMMARY_FIGURES)])
+            write([*head, *("" if figures.get(key) is None else figures[key] for key in SUMMARY_FIGURES)])
 
 
 def _outcome(job: SmoothJob, options: SmoothOptions, stream: TextIO | None) -> SmoothOutcome:

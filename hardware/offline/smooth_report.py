@@ -22,8 +22,10 @@ from hardware.report.evaluation import (
     fixed_row,
     spread,
 )
-from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, spanning, tile
-from hardware.report.report import HALF_CHART_WIDTH, PAGE_CHART_WIDTH, components, deviations
+from hardware.report.page import Plot, document, figures_table, legend, line_key, row_of_tiles, section, tile
+from hardware.report.report import COMPONENTS_TEXT, PAGE_CHART_WIDTH, component_plots, components, deviations
+
+SPECTRUM_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,16 +44,16 @@ class MotionSpectrum:
         return ("breathing", self.breathing), ("pulse", self.pulse)
 
 
-def motion_spectrum(smoothed: Smoothed, rate: float = 30.0) -> MotionSpectrum:
-    """The spectrum (Hann window) of the origin's position, resampled at `rate` Hz."""
-    times = smoothed.sample_times(rate)
+def motion_spectrum(smoothed: Smoothed) -> MotionSpectrum:
+    """The spectrum (Hann window) of the origin's position, resampled at SPECTRUM_RATE_HZ."""
+    times = smoothed.sample_times(SPECTRUM_RATE_HZ)
     positions = smoothed.at(times).base_from_surface[:, :3, 3]
     centred = positions - positions.mean(0)
     direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
     component = centred @ direction
     component = component - np.polyval(np.polyfit(times - times[0], component, 1), times - times[0])
     window = np.hanning(len(component))
-    hertz = np.asarray(np.fft.rfftfreq(len(component), 1 / rate), float)
+    hertz = np.asarray(np.fft.rfftfreq(len(component), 1 / SPECTRUM_RATE_HZ), float)
     amplitude = np.asarray(2 * np.abs(np.fft.rfft(component * window)) / max(window.sum(), 1e-9), float)
     breathing = breathing_rhythm(times, component)
     return MotionSpectrum(hertz, amplitude, direction, breathing, pulse_rhythm(times, positions, breathing))
@@ -192,7 +194,7 @@ def smooth_verdict(result: Smoothed, evaluation: SmoothEvaluation) -> str:
 
 def smooth_page(title: str, words: str, result: Smoothed, evaluation: SmoothEvaluation) -> str:
     """The page as HTML text. words: the verdict."""
-    body = [_tiles(evaluation), _trajectory(result, evaluation), _live(result, evaluation), _errors(evaluation)]
+    body = [_tiles(evaluation), _trajectory(result), _live(result, evaluation), _errors(evaluation)]
     body += [_residuals(result), _spectrum(evaluation.spectrum), _errors_by_delay(evaluation), _cameras(result)]
     footer = "Lengths in mm, time in s from the session's own clock; poses are base_from_surface."
     return document("stillbed smooth", title, words, [part for part in body if part], footer)
@@ -212,19 +214,12 @@ def _tiles(evaluation: SmoothEvaluation) -> str:
     return row_of_tiles(tiles)
 
 
-def _trajectory(result: Smoothed, evaluation: SmoothEvaluation) -> str:
+def _trajectory(result: Smoothed) -> str:
     values = components(result.states.poses, result.states.poses[0])
-    sigma = 2 * deviations(result.states.poses, result.covariance[:, :6, :6])
-    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
-    plots = []
-    for i in (0, 3, 1, 4, 2, 5):
-        plot = Plot(HALF_CHART_WIDTH, 165, _span(result), spanning([values[:, i]], 0.12, 0.5), label=names[i])
-        plot.band(result.stamps, values[:, i] - sigma[:, i], values[:, i] + sigma[:, i], "spread")
-        plot.line(result.stamps, values[:, i], "estimate")
-        plots.append(plot.svg())
-    text = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
+    sigma = deviations(result.states.poses, result.covariance[:, :6, :6])
+    plots = component_plots(_span(result), result.stamps, {"estimate": values}, sigma)
     keys = legend([line_key("estimate", "smoothed, with two standard deviations")])
-    return section("Trajectory", text, f'{keys}<div class="two">{"".join(plots)}</div>')
+    return section("Trajectory", COMPONENTS_TEXT, keys + plots)
 
 
 def _span(result: Smoothed) -> tuple[float, float]:
@@ -276,16 +271,11 @@ def _residuals(result: Smoothed) -> str:
     for i, camera in enumerate(result.rig.cameras):
         plot.line(result.stamps, rms[:, i], f"series c{i % 5}")
         keys.append(line_key(f"series c{i % 5}", camera.name))
-        by_part = [_root_mean_square(rms[part, i]) for part in parts]
+        by_part = [spread(rms[part, i][np.isfinite(rms[part, i])]).rmse for part in parts]
         rows.append([camera.name, *(figure(v) for v in by_part), f"{100 * used[i] / max(seen[i], 1):.1f} %"])
     head = ["camera, px RMS", *(f"quarter {k + 1}" for k in range(RESIDUAL_PARTS)), "inlier tracks"]
     text = "Reprojection error of the inlier tracks of each camera."
     return section("Residuals", text, legend(keys) + plot.svg() + figures_table(head, rows))
-
-
-def _root_mean_square(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
 def _spectrum(spectrum: MotionSpectrum) -> str:

@@ -263,7 +263,7 @@ def breathing_rhythm(times: Array, along: Array) -> Rhythm:
         if explained[index] < MIN_EXPLAINED or index == 0:  # at the slowest rate a drift fits best
             return Rhythm(nan, nan, "the motion has no regular rhythm")
         window_rates.append(float(rates[index]))
-    return _common_rate(window_rates, times, "breathing")
+    return _common_rate(window_rates, "breathing")
 
 
 def pulse_rhythm(times: Array, positions: Array, breathing: Rhythm) -> Rhythm:
@@ -287,7 +287,7 @@ def pulse_rhythm(times: Array, positions: Array, breathing: Rhythm) -> Rhythm:
         acceleration = np.gradient(np.gradient(positions[window], times[window], axis=0), times[window], axis=0)
         shares = [_explained_share(times[window], acceleration, candidate) for candidate in candidates]
         window_rates.append(float(candidates[np.argmax(shares)]))
-    pulse, resolution = _common_rate(window_rates, times, "pulse"), MULTIPLE_BINS / float(times[-1] - times[0])
+    pulse, resolution = _common_rate(window_rates, "pulse"), MULTIPLE_BINS / float(times[-1] - times[0])
     for k in range(2, MULTIPLES + 1):
         blurred = k * breathing.claim > resolution  # breaths differ: no spectral line at this multiple
         if abs(pulse.rate - k * breathing.rate) < resolution and not blurred:
@@ -305,7 +305,7 @@ def _windows(times: Array, name: str) -> list[slice]:
     return [slice(k * size, (k + 1) * size) for k in range(count)]
 
 
-def _common_rate(rates: Sequence[float], times: Array, name: str) -> Rhythm:
+def _common_rate(rates: Sequence[float], name: str) -> Rhythm:
     """The mean rate of the windows with its uncertainty; none where they disagree."""
     mean, spread = float(np.mean(rates)), float(np.std(rates, ddof=1))
     if spread > MAX_SPREAD[name] * mean:

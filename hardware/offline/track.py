@@ -50,7 +50,8 @@ class FrameSetStep(Protocol):
         """The pose at `frames.stamp`."""
 
     def idle(self) -> None:
-        """Do the work that no pose waits for."""
+        """Do the work that no pose waits for; there is none by default."""
+        return
 
 
 @contextmanager
@@ -113,7 +114,7 @@ def tracker(
     from perception.tracking.step import TrackingStep
     from perception.tracking.wound_step import RegionTrackingStep
 
-    scan = read_mesh(surface).scan if isinstance(surface, Path) else surface
+    scan = read_mesh(surface) if isinstance(surface, Path) else surface
     if len(rig) < 2:
         raise InputError("rig", "cameras", len(rig), "2 or more: one camera sees no depth")
     with ProcessPoolExecutor(1, SPAWN, _start_map_process) as executor:
@@ -317,12 +318,12 @@ def follow(
 def _write_report(out: Path, session: Session, complete: bool, method: str) -> str:
     """Evaluate the poses.csv in `out` into report.html and summary.json there; returns the summary as text."""
     from hardware.files.pose_file import read_poses
-    from hardware.report.evaluation import evaluate, summary_text, write_summary
+    from hardware.report.evaluation import as_dict, evaluate, summary_text, write_summary
     from hardware.report.report import write_report
 
     since = min((roi.stamp for roi in session.roi), default=float("-inf"))
     table = read_poses(out / "poses.csv")
     result = evaluate(table, session.truth, session.path.name, since, complete, session.damage, method)
-    write_summary(out / "summary.json", result)
+    write_summary(out / "summary.json", as_dict(result))
     write_report(out / "report.html", result)
     return summary_text(result)

@@ -6,9 +6,7 @@ holds what can be read.
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from estimation.rig import Rig, distort, ideal_pixels
 from estimation.se3 import Array, quaternion_from_rotation, transform_points
 from hardware.files.folder_tables import (
     checked_rows,
+    csv_table,
     read_tum,
     row_from_words,
     rows_from_trajectory,
@@ -35,6 +34,7 @@ from hardware.files.pose_file import COVARIANCE_COLUMNS, TRANSFORM_COLUMNS, TWIS
 from hardware.files.pose_file import read_poses as read_pose_table
 from hardware.files.session import Session
 from hardware.process.checks import read_csv
+from hardware.process.progress import write_atomically
 from hardware.recording.mcap_file import NO_SCHEMA, Damage, epoch_of, profile_of, record_groups
 from hardware.recording.messages import message_from_pose
 from hardware.recording.session_reader import open_session, read_poses, read_smoothed, recording_damage
@@ -51,11 +51,9 @@ def write_instants(path: Path, instants: SampledStates) -> None:
     poses = instants.base_from_surface
     numbers = np.concatenate([poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]), instants.twist], axis=1)
     spreads = [c[:, UPPER_TRIANGLE[0], UPPER_TRIANGLE[1]] for c in (instants.covariance, instants.twist_covariance)]
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(head)
+    with csv_table(path, head) as write:
         for stamp, row, *parts in zip(instants.stamps, numbers, *spreads, strict=True):
-            writer.writerow([f"{stamp:.6f}", *(f"{v:.9f}" for v in row), *(f"{v:.6g}" for v in np.concatenate(parts))])
+            write([f"{stamp:.6f}", *(f"{v:.9f}" for v in row), *(f"{v:.6g}" for v in np.concatenate(parts))])
 
 
 def read_instants(path: Path) -> tuple[Array, Array, Array]:
@@ -233,8 +231,8 @@ ADDED_TOPICS = SMOOTHED_TOPIC, VIEWERS_TOPIC = "/smoothed", "/smoothed_surface" 
 
 def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
     """Copy the .mcap file `source` to `target` with the channel /smoothed; StillbedError where it cannot be copied."""
-    part = target.with_suffix(".part.mcap")
-    try:
+
+    def copy(part: Path) -> None:
         with part.open("wb") as stream:
             writer = Writer(stream)
             writer.start(profile=profile_of(source), library="stillbed")
@@ -244,11 +242,11 @@ def write_copy(source: Path, target: Path, smoothed: Smoothed) -> None:
                     copier.write(record)
             _add_smoothed(writer, smoothed, copier.epoch)
             writer.finish()  # type: ignore[no-untyped-call]
-        os.replace(part, target)
+
+    try:
+        write_atomically(target, copy)
     except McapError as error:
         raise StillbedError(f"{source}: cannot be copied: {error}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 class _RecordCopier:
@@ -274,10 +272,7 @@ class _RecordCopier:
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             self._channels[record.id] = record
-        elif isinstance(record, Message) and self._channels[record.channel_id].topic not in (
-            SMOOTHED_TOPIC,
-            VIEWERS_TOPIC,
-        ):
+        elif isinstance(record, Message) and self._channels[record.channel_id].topic not in ADDED_TOPICS:
             number, m = self._number(record.channel_id), record
             self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
 

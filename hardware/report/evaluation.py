@@ -343,10 +343,10 @@ def finite(value: Any) -> Any:
     return value
 
 
-def write_summary(path: Path, result: Evaluation) -> None:
-    """Write summary.json."""
-    summary = as_dict(result) | {"provenance": provenance().table()}
-    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+def write_summary(path: Path, summary: dict[str, Any]) -> None:
+    """Write summary.json: figures with the provenance of what made them; a number that does not exist is null."""
+    whole = finite(summary | {"provenance": provenance().table()})
+    path.write_text(json.dumps(whole, indent=2) + "\n", encoding="utf-8")
 
 
 def summary_text(result: Evaluation) -> str:

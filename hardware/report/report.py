@@ -122,6 +122,30 @@ def deviations(poses: Array, covariance: Array) -> Array:
     return np.asarray(deviations * np.repeat([1, 180 / np.pi], 3))
 
 
+COMPONENT_NAMES = "x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °"
+COMPONENTS_TEXT = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
+
+
+def component_plots(
+    span: tuple[float, float], stamps: Array, curves: dict[str, Array], sigma: Array | None = None
+) -> str:
+    """Plots of curves (N, 6) of `components` at stamps (N,), s, by their style; position beside rotation.
+
+    sigma: (N, 6) of the last one, about which a band of two is drawn.
+    """
+    *_, last = curves.values()
+    plots = []
+    for i in (0, 3, 1, 4, 2, 5):
+        limits = page.spanning([curve[:, i] for curve in curves.values()], 0.12, 0.5)
+        plot = page.Plot(HALF_CHART_WIDTH, 165, span, limits, label=COMPONENT_NAMES[i])
+        if sigma is not None:
+            plot.band(stamps, last[:, i] - 2 * sigma[:, i], last[:, i] + 2 * sigma[:, i], "spread")
+        for style, curve in curves.items():
+            plot.line(stamps, curve[:, i], style)
+        plots.append(plot.svg())
+    return f'<div class="two">{"".join(plots)}</div>'
+
+
 def _trajectory(result: Evaluation) -> str:
     table, comparison = result.table, result.comparison
     hidden = table.is_state(TrackState.INITIALISING) | table.is_state(TrackState.LOST)  # no map yet, or no use
@@ -129,7 +153,7 @@ def _trajectory(result: Evaluation) -> str:
         return ""
     origin = table.base_from_surface[int(np.argmin(hidden))]
     values = components(table.base_from_surface, origin)
-    sigma = 2 * deviations(table.base_from_surface, table.covariance)
+    sigma = deviations(table.base_from_surface, table.covariance)
     values[hidden], sigma[hidden] = np.nan, np.nan
     truth = np.full((len(table), 6), np.nan)
     keys = [page.line_key("estimate", "estimate, with two standard deviations")]
@@ -137,18 +161,8 @@ def _trajectory(result: Evaluation) -> str:
         target = comparison.expected @ comparison.start.truth_surface_from_estimated_surface
         truth[comparison.rows] = components(target, origin)
         keys.append(page.line_key("truth", "truth" if comparison.exact else "reference"))
-    names = ("x, mm", "y, mm", "z, mm", "rotation about x, °", "rotation about y, °", "rotation about z, °")
-    plots = []
-    for name, value, two_sigma, true_value in zip(names, values.T, sigma.T, truth.T, strict=True):
-        limits = page.spanning([value, true_value], 0.12, 0.5)
-        plot = page.Plot(HALF_CHART_WIDTH, 165, _followed(result), limits, label=name)
-        plot.band(table.stamps, value - two_sigma, value + two_sigma, "spread")
-        plot.line(table.stamps, true_value, "truth")
-        plot.line(table.stamps, value, "estimate")
-        plots.append(plot.svg())
-    pairs = "".join(plots[i] for i in (0, 3, 1, 4, 2, 5))
-    text = "Position of the surface's origin in base, and rotation relative to the first pose. Time in s."
-    return page.section("Trajectory", text, f'{page.legend(keys)}<div class="two">{pairs}</div>')
+    plots = component_plots(_followed(result), table.stamps, {"truth": truth, "estimate": values}, sigma)
+    return page.section("Trajectory", COMPONENTS_TEXT, page.legend(keys) + plots)
 
 
 def _motion(result: Evaluation) -> str:

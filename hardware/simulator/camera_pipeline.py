@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from logging import WARNING
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -248,15 +248,11 @@ class PictureRenderer:
         return np.random.default_rng([self._seed, stream, camera, number])
 
 
-def _begin_rendering(pictures: PictureRenderer, now: float) -> None:
-    pictures.start()
-
-
 Exposures = dict[tuple[int, float], Shot]  # by camera and stamp, s
 
 
-class PipelineSink(Protocol):
-    """Receives pictures, print head and poses."""
+class PipelineSink:
+    """Receives pictures, print head and poses; what a sink does not override is ignored."""
 
     def picture(self, shot: Shot, kind: str, data: bytes) -> None:
         """A picture that can be decoded has arrived, as encoded by its camera."""
@@ -328,9 +324,9 @@ class CameraPipeline:
         if shot.fate is Fate.DROPPED:
             return
         self._exposures[shot.camera, shot.stamp] = shot
-        if self._pictures is not None and self._instant is not None:
-            self._pictures.expose(shot, self._instant(shot, now))
-            self._events.at(now, RENDER_EVENT, partial(_begin_rendering, self._pictures))
+        if (pictures := self._pictures) is not None and self._instant is not None:
+            pictures.expose(shot, self._instant(shot, now))
+            self._events.at(now, RENDER_EVENT, lambda now: pictures.start())
         self._events.at(shot.arrival, ARRIVAL_EVENT, partial(self._arrive, shot))
 
     def _arrive(self, shot: Shot, now: float) -> None:

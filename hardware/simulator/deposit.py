@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.spatial import cKDTree
 
 from estimation.se3 import Array
@@ -249,17 +249,8 @@ def _spread(places: Array, material: Array, shape: tuple[int, int], disc: Array)
         for y in (0, 1):
             weight = material * np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1])
             dots += np.bincount((corner[:, 1] + y) * shape[1] + corner[:, 0] + x, weight, len(dots))
-    thickness = convolved(dots.reshape(shape), disc)
+    thickness = cv2.filter2D(dots.reshape(shape), -1, disc, borderType=cv2.BORDER_CONSTANT)  # the disc is symmetric
     return np.asarray(np.where(thickness > 1e-9, thickness, 0.0))  # the transform has errors of 1e-16
-
-
-def convolved(values: Array, weights: Array) -> Array:
-    """Values (M, N) convolved with weights (K, K), K odd, like scipy.signal.fftconvolve, whose import takes 1 s."""
-    full = [size + len(weights) - 1 for size in values.shape]
-    padded = [next_fast_len(size, real=True) for size in full]
-    whole = irfft2(rfft2(values, padded) * rfft2(weights, padded), padded)
-    rows, columns = ((size - length) // 2 for size, length in zip(full, values.shape, strict=True))
-    return np.asarray(whole[rows : rows + values.shape[0], columns : columns + values.shape[1]])
 
 
 def _disc(width: float) -> Array:

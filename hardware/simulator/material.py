@@ -190,7 +190,7 @@ class SimulatedDispensers:
     def open_outside(self, until: float, unattended: Sequence[tuple[float, float]] = ()) -> float:
         """How long, s, until `until`, a device was commanded open while no move that prints was sent.
 
-        unattended: from, until, s: when no command could reach it; that time counts in `open_unattended`.
+        unattended: from, until, s: when no command could reach it; that time does not count.
         """
         begin = np.array([start for start, _ in self._permits])
         end = np.minimum([end for _, end in self._permits], np.append(begin[1:], until)[: len(begin)])
@@ -209,28 +209,13 @@ class SimulatedDispensers:
             outside += float(length[open_now & ~allowed & (length > ROUNDING)].sum())
         return outside
 
-    def open_unattended(self, unattended: Sequence[tuple[float, float]], until: float) -> float:
-        """The longest time, s, that a device stayed open since commands failed; unattended: from, until, s."""
-        longest = 0.0
-        for stamps, flows in map(self._switches, self.models):
-            for lost, restored in unattended:
-                if lost < until and flows[np.searchsorted(stamps, lost, "right") - 1] > 0:
-                    closed = stamps[(stamps > lost) & (flows == 0)]
-                    longest = max(longest, min(closed[0] if len(closed) else until, restored, until) - lost)
-        return longest
-
-    def open_at(self, instants: Array) -> NDArray[np.bool_]:
-        """Whether a device was open by its last command (N,), and had not closed itself, at instants (N,), s."""
-        is_open = np.zeros(len(instants), bool)
-        for stamps, flows in map(self._switches, self.models):
-            is_open |= flows[np.searchsorted(stamps, instants, "right") - 1] > 0
-        return is_open
-
     def flow(self, instants: Array, planned: Array) -> Array:
         """The true flow (N,), mm^3/s, at instants (N,), s. planned: (N,) mm^3/s, what the bead needs."""
         share = self._passing_share(instants)
-        if self.ideal:
-            return np.asarray(planned * self.open_at(instants) * share)
+        if self.ideal:  # the planned one while a device is open by its last command, and has not closed itself
+            switches = map(self._switches, self.models)
+            is_open = [flows[np.searchsorted(stamps, instants, "right") - 1] > 0 for stamps, flows in switches]
+            return np.asarray(planned * np.any(is_open, axis=0) * share)
         return np.asarray(sum(model.flow_at(instants) for model in self.models) * share)
 
     def _passing_share(self, instants: Array) -> Array:

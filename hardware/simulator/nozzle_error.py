@@ -256,12 +256,8 @@ def _printing(log: NozzleLog, line: PlannedLine) -> tuple[NDArray[np.bool_], int
     finished = bool((placed & ~unfinished).any())
     active = np.flatnonzero(unfinished | log.extrude)
     end = int(active[-1]) + 1 if finished and len(active) else len(log)
-    rows = np.arange(len(log))
-    last_known = np.maximum.accumulate(np.where(placed, rows, -1))
-    place = np.where(last_known >= 0, log.place[last_known], 0.0)
-    due = line.printed[line.piece(place)] & (rows < end)
-    first = int(np.argmax(log.extrude)) if log.extrude.any() else len(log)
-    return due & (rows >= first), end, finished
+    rows, first = np.arange(len(log)), int(np.argmax(log.extrude)) if log.extrude.any() else len(log)
+    return line.printed[row_pieces(log, line)] & (rows >= first) & (rows < end), end, finished
 
 
 HALF_FLOW = 0.5  # of the planned flow

@@ -38,6 +38,7 @@ from hardware.simulator.cameras import JITTER_LIMIT, Shot
 from hardware.simulator.deposit import NozzleLog, PlannedLine
 from hardware.simulator.nozzle_error import nozzle_errors
 from hardware.simulator.scenario import Scenario
+from hardware.simulator.world import WorldSink
 from perception.frames import FrameSet, Image, PrintHead, Roi
 from perception.tracking.step import STAGES, StepReport, TrackingStep
 from planning.command import Move
@@ -195,7 +196,7 @@ def clear_run(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-class RunFolder:
+class RunFolder(WorldSink):
     """Writes a run; a context manager that leaves all files readable on any end."""
 
     def __init__(
@@ -275,7 +276,10 @@ class RunFolder:
         if self._session is not None:
             self._session[1].write(report.observations)
             self._session[1].write(pose)
-            self._show_landmarks(pose.stamp)
+            surface_map = None if self._tracker is None else self._tracker.map
+            if surface_map is not None and pose.stamp >= self._last_map + LANDMARKS_PERIOD:
+                self._last_map = pose.stamp
+                self._session[1].show_surface(pose.stamp, surface_map.points)
             error, log = "not printing", self.logs[-1] if self.logs else None
             if log is not None and log.extrude.any():
                 errors = (log.base_from_nozzle - log.base_from_target)[log.extrude, :3, 3]
@@ -283,14 +287,6 @@ class RunFolder:
             time = f"{pose.stamp:.1f} of {self._seconds:g} s"
             facts = [("time", time), ("arm", self._activity), ("error at the nozzle", error)]
             self.watch.show(frames, pose, self._line_points, facts)
-
-    def _show_landmarks(self, stamp: float) -> None:
-        """Every LANDMARKS_PERIOD, as the map grows."""
-        if self._session is None or self._tracker is None or stamp < self._last_map + LANDMARKS_PERIOD:
-            return
-        if (surface_map := self._tracker.map) is not None:
-            self._last_map = stamp
-            self._session[1].show_surface(stamp, surface_map.points)
 
     def look(self, look: Look) -> None:
         """The result of a look at what was printed."""
@@ -315,9 +311,6 @@ class RunFolder:
             self._commands.send(data)
         if self._session is not None:
             (self._session[1].sent if sent else self._session[1].received)(stamp, data)
-
-    def pose_delivery(self, pose: SurfacePose) -> None:
-        """A pose has reached the motion; `pose` has written it."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
         """A tick, and the progress of the print by it; None before the path was placed."""

@@ -149,6 +149,8 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
     quality = checks.integer(path, "sensor.jpeg_quality", parts["sensor"].pop("jpeg_quality", 90), 0)
     if quality > 100:
         raise InputError(path, "sensor.jpeg_quality", quality, "1 to 100, or 0 for lossless pictures")
+    faults = faults_from_texts(path, "faults", table.get("faults", []))
+    check_faults(faults, FaultRunner.SIMULATE, path, "faults", len(rig))
     strain_rng = np.random.default_rng([seed, STRAIN_STREAM])
     return Scenario(
         file=path,
@@ -171,15 +173,15 @@ def read_scenario(path: str | Path, trace: Path | None = None) -> Scenario:
         cameras=camera_settings_from_table(path, parts["cameras"], [camera.name for camera in rig.cameras]),
         sensor=sensor_from_table(path, parts["sensor"]),
         jpeg_quality=quality or None,
-        tracking=_tracking(path, parts["tracking"]),
+        tracking=checks.record_from_table(path, "tracking.", parts["tracking"], _tracking, TRACKING_KEYS),
         arm=arm,
         dispenser=dispenser_from_table(path, parts["dispenser"], path.parent),
-        faults=_faults(path, table.get("faults", []), len(rig)),
+        faults=faults,
         true_arm=profile.arm,
         baud=baud,
         profile=replace(profile, arm=replace(profile.arm, arm_from_base=profile.arm.arm_from_base @ arm_shift)),
         limits=limits_from_table(path, parts["limits"]),
-        gel=_gel(path, parts["gel"]),
+        gel=checks.record_from_table(path, "gel.", parts["gel"], Gel, GEL_KEYS) if parts["gel"] else None,
         adapt=_adapt(path, table),
         looks=beads_between_looks(path, "look", table.get("look")),
     )
@@ -190,10 +192,6 @@ GEL_KEYS: checks.Keys = {
     "sag_s": ("sag_time", checks.within(0.01, 1000, "s")),
     "gloss": ("gloss", checks.within(0, 1)),
 }
-
-
-def _gel(path: Path, table: Table) -> Gel | None:
-    return checks.record_from_table(path, "gel.", table, Gel, GEL_KEYS) if table else None
 
 
 def _adapt(path: Path, table: Table) -> bool:
@@ -247,11 +245,7 @@ def _arm(path: Path, table: Table) -> tuple[ArmSettings, ArmProfile, float]:
     return settings, replace(profile, lag=lag), float(baud)
 
 
-def _tracking(path: Path, table: Table) -> TrackingSettings:
-    return checks.record_from_table(path, "tracking.", table, _settings, TRACKING_KEYS)
-
-
-def _settings(by: str = "pictures", register: str = "texture", **timing: float | None) -> TrackingSettings:
+def _tracking(by: str = "pictures", register: str = "texture", **timing: float | None) -> TrackingSettings:
     method = MAP_METHOD if by in ("pictures", *WITHOUT_PICTURES) else by
     pictures, scan = by not in WITHOUT_PICTURES, register == "scan"
     return TrackingSettings(pictures, by == "tracks", **timing, scan=scan, method=method)
@@ -268,9 +262,3 @@ TRACKING_KEYS: checks.Keys = {
     "processing_s": ("processing", _processing),
     "register": ("register", checks.word(("texture", "scan"))),
 }
-
-
-def _faults(path: Path, value: object, cameras: int) -> tuple[Fault, ...]:
-    faults = faults_from_texts(path, "faults", value)
-    check_faults(faults, FaultRunner.SIMULATE, path, "faults", cameras)
-    return faults

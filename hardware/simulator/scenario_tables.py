@@ -166,7 +166,7 @@ def sensor_from_table(where: object, table: Table) -> Sensor:
 
 
 def _scanned(path: Path, wound: Wound | None, seed: int) -> Shape:
-    scan = read_mesh(path).scan
+    scan = read_mesh(path)
     longest = float(np.ptp(scan.vertices, axis=0).max())
     if longest > MAX_SCAN_SIZE:
         raise InputError(path, "size of the scan", f"{longest:.4g} mm", f"at most {MAX_SCAN_SIZE:g} mm in a scene")

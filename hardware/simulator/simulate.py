@@ -7,7 +7,6 @@ them nearly all of the time of a simulated second; its estimator is that of a li
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -36,8 +35,7 @@ from hardware.offline.track import FrameSetStep, step_by
 from hardware.process.clock import WallClock
 from hardware.process.faults import Fault, FaultKind, FaultPart, FaultRunner, check_faults
 from hardware.process.progress import Progress, prepare_out
-from hardware.process.system import provenance
-from hardware.report.evaluation import Evaluation, evaluate, write_summary
+from hardware.report.evaluation import Evaluation, as_dict, evaluate, write_summary
 from hardware.report.page import open_in_browser
 from hardware.report.report import write_report
 from hardware.simulator.camera_pipeline import Exposures, PictureStore
@@ -54,7 +52,7 @@ from hardware.simulator.truth import Truth, disturbed_motion, drape_path, fold_d
 from hardware.simulator.world import SimulatedWorld
 from perception.frames import FrameSet, Roi
 from perception.tracking import MAP_METHOD
-from perception.tracking.step import STAGES, StepReport, TrackingStep, report_without_offsets
+from perception.tracking.step import STAGES, TrackingStep, report_without_offsets
 from planning.laid_beads import with_looks
 from planning.material import is_metered
 from planning.path import Path as Checkpoints
@@ -68,10 +66,8 @@ USABLE_GAINS = 0.2, 4.0  # of a picture with visible landmarks
 MIN_INITIAL_TRACKS = 30  # of the first pose
 
 
-class LandmarkTracker:
+class LandmarkTracker(FrameSetStep):
     """A tracking step without pictures, from projected landmarks."""
-
-    last: StepReport
 
     def __init__(
         self, true_rig: Rig, known_rig: Rig, truth: Truth, shape: Shape, shot: Callable[[int, float], Shot], seed: int
@@ -96,9 +92,6 @@ class LandmarkTracker:
         used = np.bincount(observations.camera, minlength=self._cameras)
         self.last = report_without_offsets(observations, used, np.zeros(len(STAGES)))
         return pose
-
-    def idle(self) -> None:
-        """There is nothing else to do."""
 
     def _pose(self, observations: Observations) -> SurfacePose:
         if self._follower is not None:
@@ -133,10 +126,8 @@ class LandmarkTracker:
 EXACT_COVARIANCE = np.diag([1e-12] * 3 + [1e-8] * 3)  # rad^2, mm^2: exact, but invertible
 
 
-class OracleTracker:
+class OracleTracker(FrameSetStep):
     """A tracking step without pictures, from the truth."""
-
-    last: StepReport
 
     def __init__(self, truth: Truth, offset: Array, exposed: Callable[[int, float], float], cameras: int) -> None:
         """offset: (4, 4) known_base_from_base, by the errors of the known rig.
@@ -154,9 +145,6 @@ class OracleTracker:
         self.last = report_without_offsets(observations, counts, np.zeros(len(STAGES)))
         surface_pose = SurfacePose(frames.stamp, self._offset @ pose, EXACT_COVARIANCE, twist, TrackState.TRACKING)
         return replace(surface_pose, forecast=self._predictor.add(surface_pose))
-
-    def idle(self) -> None:
-        """There is nothing else to do."""
 
 
 # faults that pictures show
@@ -270,9 +258,10 @@ def _check_pairs(scenario: Scenario, scene: Scene) -> None:
     if (scenario.strain is None) != (scene.deformation == UNDEFORMED):
         allowed = "both (how much over time, and of what) or neither"
         raise InputError(scenario.file, "strain, scene.deformation", "one of the two", allowed)
-    if scenario.looks is not None and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
+    by_pictures = scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD
+    if scenario.looks is not None and not by_pictures:
         raise InputError(scenario.file, "look", scenario.looks, 'with tracking.by = "pictures": cameras look')
-    if scenario.tracking.scan and not (scenario.tracking.pictures and scenario.tracking.method == MAP_METHOD):
+    if scenario.tracking.scan and not by_pictures:
         allowed = 'with by = "pictures": nothing else registers to a scan'
         raise InputError(scenario.file, "tracking.register", "scan", allowed)
     if not (scenario.tracking.pictures or scenario.tracking.tracks):
@@ -307,8 +296,7 @@ def _write_results(
     run = NozzleRun(title, log, path, bead, limits, open_outside, tracking, complete, pictures, files, looks)
     result = evaluate_run(run)
     summary = nozzle_dict(result) | {"frame_sets_skipped": skipped, "faults": [str(f) for f in scenario.faults]}
-    summary["provenance"] = provenance().table()
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_summary(out / "summary.json", summary)
     (out / "report.html").write_text(nozzle_page(result), encoding="utf-8")
     folder.watch.finish(summary["verdict"][0])
     busy = f"{skipped} frame sets found the tracker busy and were left out\n" if skipped else ""
@@ -324,7 +312,7 @@ def _tracking_report(
     tracking = scenario.tracking
     method = tracking.method if tracking.pictures else "tracks" if tracking.tracks else "truth"
     result = evaluate(table, trajectory, scenario.title, start, complete, method=method)
-    write_summary(folder / "summary.json", result)
+    write_summary(folder / "summary.json", as_dict(result))
     write_report(folder / "report.html", result)
     return result
 

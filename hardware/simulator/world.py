@@ -11,12 +11,11 @@ A simulated operator arms the arm once the path is placed, and again after a sto
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from logging import INFO, WARNING
-from typing import Protocol
 
 import numpy as np
 
@@ -36,7 +35,7 @@ from hardware.process.faults import FaultKind, FaultPart, faults_striking
 from hardware.process.progress import ProgressReport, no_progress
 from hardware.recording.loop_record import LoopKeeper, RecordingSource, drop_record
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import PortFaults, VirtualDevice
+from hardware.simulator.arm.ports import VirtualDevice
 from hardware.simulator.camera_pipeline import (
     TICK_EVENT,
     CameraPipeline,
@@ -65,7 +64,7 @@ SERVICE_DELAY = 0.3  # s from a dispenser's fault until the operator resets it, 
 LOOK_DURATION = 2.5  # s for the evaluation of a look: 2 s on an idle core
 
 
-class WorldSink(PipelineSink, Protocol):
+class WorldSink(PipelineSink):
     """Receives everything that happens in a run."""
 
     def tick(self, tick: Tick, progress: PrintProgress | None) -> None:
@@ -87,33 +86,13 @@ class WorldSink(PipelineSink, Protocol):
         """The result of a look at what was printed."""
 
 
-class _Wire:
-    """Hands the bytes at the arm's port to the sink."""
-
-    def __init__(self, sink: WorldSink, clock: Clock) -> None:
-        self._sink, self._clock = sink, clock
-
-    def from_host(self, data: bytes) -> None:
-        self._sink.wire(self._clock.now(), data, True)
-
-    def to_host(self, sent: bytes, read: bytes) -> None:
-        self._sink.wire(self._clock.now(), read, False)
-
-    def opened(self) -> None:
-        pass
-
-    def to_arm(self, data: bytes) -> None:
-        pass
-
-
 class _SimulatedOperator:
-    """The orders of an operator. service_times: s, at which he refilled or reset a dispenser."""
+    """The orders of an operator."""
 
     def __init__(self, material: MaterialControl) -> None:
         self._material = material
         self._last_order, self._unready_since = -math.inf, -math.inf
         self._homed = False
-        self.service_times: list[float] = []
 
     def __call__(self, progress: PrintProgress | None, state: ArmState, tracking: bool, now: float) -> list[LoopOrder]:
         """state: of the arm. tracking: whether the newest pose is TRACKING."""
@@ -126,11 +105,9 @@ class _SimulatedOperator:
         unready = self._material.reason
         self._unready_since = self._unready_since if unready else now
         if progress.wanted and progress.wanted != LOOK:
-            self.service_times.append(now)
             orders.append(PauseOrder.MATERIAL_IN)
         elif unready and now >= self._unready_since + SERVICE_DELAY:
             self._unready_since = now
-            self.service_times.append(now)
             orders.append(PauseOrder.RESUME)
         if state not in (ArmState.STOPPED, ArmState.DISARMED) or not tracking or now < self._last_order + ORDER_PERIOD:
             return orders
@@ -172,7 +149,7 @@ class SimulatedWorld:
         self._events = EventQueue(self._time)
         profile, faults, self._commanded_pose = scenario.profile, scenario.faults, CommandedPose(scenario.profile)
         self.arm = VirtualArm(scenario.arm, profile.dialect, profile.arm.home, faults, scenario.baud)
-        self._device = VirtualDevice(self.arm, self._time, scenario.baud, listener=_Wire(sink, self._time))
+        self._device = VirtualDevice(self.arm, self._time, scenario.baud, self._put_bytes)
         self._truth_log = TruthLog(path, scenario.true_arm, truth, profile.tick, profile.lag)
         pictures: PictureRenderer | None = None
         if scenario.tracking.pictures:
@@ -220,29 +197,10 @@ class SimulatedWorld:
         """Give the motion an order."""
         self._queued_orders.append(order)
 
-    def every(self, period: float, action: Callable[[float], None]) -> None:
-        """Call `action` with the instant, s, every `period` s from 0 s on."""
-
-        def act(now: float) -> None:
-            self._events.at(now + period, TICK_EVENT, act)
-            action(now)
-
-        self._events.at(0.0, TICK_EVENT, act)
-
-    @property
-    def service_times(self) -> list[float]:
-        """Instants, s, at which the operator refilled or reset a dispenser."""
-        return self._operator.service_times
-
     @property
     def open_outside(self) -> float:
         """How long, s, a dispenser was commanded open until now while no move that prints was sent."""
         return self.dispensers.open_outside(self.elapsed, self._unattended)
-
-    @property
-    def open_unattended(self) -> float:
-        """The longest time, s, that a dispenser stayed open after its line or the motion failed."""
-        return self.dispensers.open_unattended(self._unattended, self.elapsed)
 
     @property
     def elapsed(self) -> float:
@@ -272,7 +230,7 @@ class SimulatedWorld:
             if fault.kind is FaultKind.KILL or fault.end >= self.scenario.seconds:
                 self._killed = True
                 self.dispensers.disconnect()
-                self._device.faults = PortFaults(away=[(now, math.inf)])
+                self._device.away = [(now, math.inf)]
                 self._end = min(self._end, now + KILL_TAIL)
                 raise _MotionKilledError
             self._advance(fault.end)
@@ -325,6 +283,9 @@ class SimulatedWorld:
             self._beads.draw(self._scene, until)
 
     # -- inputs and outputs of the motion
+
+    def _put_bytes(self, data: bytes, sent: bool) -> None:
+        self._sink.wire(self._time.now(), data, sent)
 
     def _on_pose(self, pose: SurfacePose, frames: FrameSet, observations: Observations) -> None:
         """Begin the print with the path in the tracker's surface frame, as soon as that frame can be measured."""

@@ -34,9 +34,9 @@ from hardware.process.clock import CpuClock
 from hardware.simulator.scene.appearance import Appearance
 from hardware.simulator.scene.scene import Scene, rois
 from hardware.simulator.scene.shape import Wound, cylinder, with_wound
-from hardware.simulator.watched_arm import PictureLoop, closed_motion
 from perception.frames import Frame, FrameSet
 from perception.tracking.step import TrackingStep
+from tests.picture_loop import PictureLoop, closed_motion
 
 HALF_PERIOD = 0.016  # s, half a frame period at 30 Hz: webcams are not synchronised
 

@@ -23,13 +23,14 @@ from numpy.typing import NDArray
 from estimation.errors import InputError, StillbedError
 from estimation.se3 import Array
 from hardware.bench import figures
-from hardware.bench.fault_run import FaultRun, FaultRunRecord, prepare_scenario
 from hardware.bench.figures import Figure, at_least, at_most, columns, with_progress, workers
+from hardware.bench.loop_run import prepare_scenario
 from hardware.process.clock import ProcessorClock
 from hardware.process.faults import FAULT_SPECS, Fault, FaultKind, FaultPart, FaultRunner, fault_from_text
 from hardware.simulator.deposit import NozzleLog
 from perception import shipped_file
-from tests.campaigns.verdicts import kind_table
+from tests.campaigns.verdicts import kind_table, log_rows
+from tests.fault_run import FaultRun, FaultRunRecord
 
 RowFlags = NDArray[np.bool_]
 
@@ -260,7 +261,7 @@ def one_run(seed: int, number: int) -> list[FaultRow]:
     scenario = SCENARIOS[number % len(SCENARIOS)]
     faults, clock = draw_faults(seed, number), ProcessorClock()
     start = clock.now()
-    run = FaultRun(prepared(shipped_file("scenarios", f"{scenario}.toml")), faults, 1000 * seed + number)()
+    run = FaultRun(prepared(shipped_file("scenarios", f"{scenario}.toml")), faults, 1000 * seed + number).record()
     spent = clock.now() - start
     ends = [*(fault.start for fault in faults[1:]), run.end]
     verdicts = [judge_fault(run, fault, end) for fault, end in zip(faults, ends, strict=True)]
@@ -282,7 +283,7 @@ def append_log(file: Path, rows: Iterable[FaultRow]) -> None:
 def read_log(file: Path, seed: int) -> list[FaultRow]:
     """The rows of a campaign with this seed; InputError where the file is none of ours."""
     rows = []
-    for number, each in figures.log_rows(file, FAULT_LOG_COLUMNS):
+    for number, each in log_rows(file, FAULT_LOG_COLUMNS):
         try:
             numbers = [float(each[name]) for name in FAULT_LOG_COLUMNS if name not in ("scenario", "fault")]
         except (TypeError, ValueError):

@@ -24,8 +24,9 @@ from types import FrameType
 import numpy as np
 
 from estimation.errors import InputError, StillbedError
-from hardware.bench.figures import Figure, append_rows, at_most, log_rows
+from hardware.bench.figures import Figure, append_rows, at_most
 from hardware.process.clock import ProcessorClock
+from tests.campaigns.verdicts import log_rows
 
 NUMBER_TEXT = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 BAD_VALUES = (

@@ -15,7 +15,7 @@ import numpy as np
 from estimation.pose import SurfacePose
 from estimation.se3 import Array
 from hardware.arm import protocol
-from hardware.arm.device import ArmState
+from hardware.arm.device import BY_OPERATOR, ArmState
 from hardware.arm.link import Arm
 from hardware.arm.profile import ArmProfile, LinkSettings
 from hardware.arm.protocol import FRAME_LENGTH, FRAME_TAILS, REPLY_LENGTH, REPLY_TAILS, FrameStream
@@ -25,9 +25,10 @@ from hardware.motion.loop import MotionLoop, Order, Tick
 from hardware.process.clock import SimClock
 from hardware.process.faults import Fault, FaultKind, FaultPart
 from hardware.simulator.arm.controller import VirtualArm
-from hardware.simulator.arm.ports import Interval, PortFaults, VirtualDevice
+from hardware.simulator.arm.ports import Interval
 from hardware.simulator.arm.settings import ArmSettings, ReplyMode
 from planning.command import Command, Move, feed_for
+from tests.faulty_port import FaultyDevice, PortFaults
 
 RUN_SECONDS = 600.0  # of one run
 MAX_STALL = 0.6  # s of a stall
@@ -150,7 +151,7 @@ class LinkRun:
         self._virtual = VirtualArm(settings, profile.dialect, profile.arm.home, faults, profile.baud)
         port = PortFaults(windows(rng, 30.0, MAX_STALL), windows(rng, 100.0, 5.0), 0.1, 2.0, 0.005 * (manner == LOSSY))
         self._blocked = port.blocked
-        device = VirtualDevice(self._virtual, self._clock, profile.baud, port, seed, _PortLogger(counts))
+        device = FaultyDevice(self._virtual, self._clock, profile.baud, port, seed, _PortLogger(counts))
         self._stalls = windows(rng, 30.0, MAX_STALL)  # of the host's loop
         self._arm = Arm(S6H4D(device, profile), profile, 0.0, LinkSettings(poll=POLL_INTERVAL))
         self._phase, self._last_frame, self._frames, self._stops = 0.0, -1.0, 0, 0
@@ -226,7 +227,9 @@ class LinkRun:
     def _count_run(self) -> None:
         counts, virtual, events = self._counts, self._virtual, self._arm.events()
         counts.unplugged += sum(event.state is ArmState.UNPLUGGED for event in events)
-        counts.faults += sum(event.state is ArmState.STOPPED and not event.by_operator for event in events)
+        counts.faults += sum(
+            event.state is ArmState.STOPPED and not event.text.endswith(BY_OPERATOR) for event in events
+        )
         counts.frames += virtual.frames
         counts.overflows += len(virtual.ignored)
         counts.refused += len(virtual.refused)

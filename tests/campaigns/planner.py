@@ -20,7 +20,6 @@ from estimation.pose import Forecast, SurfacePose, TrackState
 from estimation.se3 import Array
 from estimation.surface_map import Warp
 from hardware.arm.profile import ArmProfile
-from hardware.bench.fault_run import AXES_LIMITS, AxesOracle
 from hardware.bench.figures import Figure, at_least, at_most, milliseconds, percentile, with_progress
 from hardware.process.clock import CpuClock
 from planning.command import Hold, Move
@@ -30,6 +29,7 @@ from planning.motion.guard import Guard
 from planning.motion.planner import STALL_TICKS, Planner
 from planning.motion.retime import Timing, axis_derivatives, retime, run_times
 from planning.path import MIN_SPACING, Path, PrintPhase, progress_mark, resume_fraction, way_lengths
+from tests.fault_run import AXES_LIMITS, AxesOracle
 
 Draw = np.random.Generator
 Tick = tuple[float, SurfacePose | None]  # now, s, and the newest pose

@@ -22,7 +22,7 @@ from hardware.bench.figures import Figure, at_least, at_most, rms
 from hardware.process.checks import Table
 from hardware.simulator.motion_table import motion_from_tables, waveform_from_table
 from hardware.simulator.scenario_tables import scene_from_table
-from hardware.simulator.scene.appearance import Sensor, unlit_texture
+from hardware.simulator.scene.appearance import Appearance, Sensor
 from hardware.simulator.scene.fields import smooth_noise
 from hardware.simulator.scene.render import render
 from hardware.simulator.scene.scene import Scene, WorldState, rois
@@ -124,8 +124,9 @@ def _cube(seed: int) -> Scene:
 
     side, rng = round(CUBE_FACE / CUBE_TEXEL), np.random.default_rng([seed, 83])
     grain = sum(smooth_noise((side, side), size, rng) for size in (1.0, 2.0, 4.0, 8.0, 16.0))
-    texture = unlit_texture(np.dstack([np.clip(128 + 16 * grain, 0, 255).astype(np.uint8)] * 3), CUBE_TEXEL)
-    return Scene(shape_from_function(height, (CUBE_FACE, CUBE_FACE)), texture, seed=seed)
+    texture = np.dstack([np.clip(128 + 16 * grain, 0, 255).astype(np.uint8)] * 3)
+    look = Appearance(texel=CUBE_TEXEL, drape=False, texture=texture, lit=False)
+    return Scene(shape_from_function(height, (CUBE_FACE, CUBE_FACE)), look, seed=seed)
 
 
 def _tracked(scene: Scene, truth: Truth, rig: Rig, stamps: Array) -> Iterator[SurfacePose]:

@@ -8,6 +8,18 @@ const STAGES = { print: "#4c9a6a", paused: "#e3b23c", stopped: "#c8553d", failed
 const LEFT = 44, FOOT = 62;
 const SHORTEST = 0.2; // s that are shown at least
 
+// a line through the places [x, y] of every so many instants before `end`, with a gap where there is none
+export function trace(g, end, every, place) {
+  g.beginPath();
+  let pen = false;
+  for (let i = 0; i < end; i += every) {
+    const p = place(i);
+    if (p) pen ? g.lineTo(...p) : g.moveTo(...p);
+    pen = Boolean(p);
+  }
+  g.stroke();
+}
+
 export class Timeline {
   constructor(canvas) {
     this.canvas = canvas;
@@ -108,25 +120,12 @@ export class Timeline {
     COLOURS.forEach((colour, axis) => {
       g.strokeStyle = colours[colour];
       g.lineWidth = 1.6 * ratio;
-      g.beginPath();
-      let pen = false;
-      for (let i = 0; i < stamps.length; i += every) {
-        const p = this.moved[i];
-        if (p) pen ? g.lineTo(x(stamps[i]), y(p[axis])) : g.moveTo(x(stamps[i]), y(p[axis]));
-        pen = p !== null;
-      }
-      g.stroke();
+      trace(g, stamps.length, every, (i) => this.moved[i] && [x(stamps[i]), y(this.moved[i][axis])]);
     });
     if (this.worst > 0) {
       g.strokeStyle = "#a65fb8";
       g.setLineDash([4 * ratio, 3 * ratio]);
-      g.beginPath();
-      for (let i = 0, pen = false; i < stamps.length; i += every) {
-        const at = off[i] === null ? 0 : floor - ((floor - top) * off[i]) / (1.05 * this.worst);
-        if (off[i] !== null) pen ? g.lineTo(x(stamps[i]), at) : g.moveTo(x(stamps[i]), at);
-        pen = off[i] !== null;
-      }
-      g.stroke();
+      trace(g, stamps.length, every, (i) => off[i] !== null && [x(stamps[i]), floor - ((floor - top) * off[i]) / (1.05 * this.worst)]);
       g.setLineDash([]);
     }
     runs(states, (name, from, wide) => {

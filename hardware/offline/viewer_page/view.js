@@ -3,13 +3,14 @@ import { inverse, moved, product } from "./lens.js";
 import { Panes } from "./panes.js";
 import { SceneView } from "./scene.js";
 import { onTheme, themeButton } from "./theme.js";
-import { Timeline } from "./timeline.js";
+import { Timeline, trace } from "./timeline.js";
 import { figure, TRACKING } from "./words.js";
 
 const WAY = 4000; // points of the trajectory that are drawn
 const AXES = ["#c8553d", "#4c9a6a", "#2a6f97"]; // of the surface frame: x, y, z
 const GIVEN = { truth: "Truth", reference: "Reference" }; // poses that nobody estimated have no state
 const by = (id) => document.getElementById(id);
+const text = (tag, words) => Object.assign(document.createElement(tag), { textContent: words });
 const state = { session: null, k: 0, wanted: -1, busy: false, seen: null, poses: null, first: null, playing: false, begun: 0, from: 0, chosen: null, near: true };
 const panes = new Panes(by("pictures"), choose);
 
@@ -19,17 +20,10 @@ class Film extends SceneView {
     if (!this.scene || !state.session) return;
     const g = this.canvas.getContext("2d"), place = this.project(this.canvas.width, this.canvas.height), all = state.session.places;
     const every = Math.max(1, Math.ceil(all.length / WAY)), ratio = window.devicePixelRatio || 1;
-    for (const [from, to, colour] of [[0, all.length, "rgb(138 79 160 / .3)"], [0, state.k + 1, "#8a4fa0"]]) {
+    for (const [end, colour] of [[all.length, "rgb(138 79 160 / .3)"], [state.k + 1, "#8a4fa0"]]) {
       g.strokeStyle = colour;
       g.lineWidth = 1.6 * ratio;
-      g.beginPath();
-      let pen = false;
-      for (let i = from; i < to; i += every) {
-        const p = all[i] && place(all[i]);
-        if (p) pen ? g.lineTo(p[0], p[1]) : g.moveTo(p[0], p[1]);
-        pen = Boolean(p);
-      }
-      g.stroke();
+      trace(g, end, every, (i) => all[i] && place(all[i]));
     }
     if (view && view.tracking) this.axes(g, place, view.tracking.base_from_surface, ratio);
   }
@@ -74,10 +68,7 @@ function go(k) {
   const last = state.session.stamps.length - 1;
   state.k = Math.min(Math.max(Math.round(k), 0), last);
   by("time").value = state.k;
-  const t = state.session.stamps[state.k];
-  const small = document.createElement("small");
-  small.textContent = `${state.k + 1} of ${last + 1}`;
-  by("now").replaceChildren(`${t.toFixed(2)} s`, small);
+  by("now").replaceChildren(`${state.session.stamps[state.k].toFixed(2)} s`, text("small", `${state.k + 1} of ${last + 1}`));
   state.wanted = state.k;
   fetchNewest();
   refresh();
@@ -126,11 +117,7 @@ function show() {
   const about = !tracking ? { word: "No pose", tone: "" } : given ? { word: given, tone: "wait" } : TRACKING[tracking.state];
   by("chip").textContent = about.word;
   document.body.dataset.tone = about.tone;
-  const put = (name, value, unit) => {
-    const small = document.createElement("small");
-    small.textContent = value === "–" ? "" : unit;
-    document.querySelector(`[data-tile=${name}] b`).replaceChildren(value, small);
-  };
+  const put = (name, value, unit) => document.querySelector(`[data-tile=${name}] b`).replaceChildren(value, text("small", value === "–" ? "" : unit));
   if (tracking && !state.first) state.first = tracking.base_from_surface;
   const change = tracking && product(inverse(state.first), tracking.base_from_surface);
   const sine = change && Math.hypot(change[2][1] - change[1][2], change[0][2] - change[2][0], change[1][0] - change[0][1]) / 2;
@@ -149,16 +136,8 @@ function show() {
 function tell() {
   const { stamps, held, events, stages } = state.session, now = stamps[state.k];
   const before = (all) => all.filter(([t]) => t <= now), stage = before(stages).pop();
-  const lines = [held[state.k] && `held: ${held[state.k]}`, stage && `stage: ${stage[1]}`].filter(Boolean).map((words) => {
-    const line = document.createElement("b");
-    line.textContent = `${words}  `;
-    return line;
-  });
-  const said = before(events).slice(-2).reverse().map(([t, words]) => {
-    const line = document.createElement("div");
-    line.textContent = `${t.toFixed(2)} s  ${words}`;
-    return line;
-  });
+  const lines = [held[state.k] && `held: ${held[state.k]}`, stage && `stage: ${stage[1]}`].filter(Boolean).map((words) => text("b", `${words}  `));
+  const said = before(events).slice(-2).reverse().map(([t, words]) => text("div", `${t.toFixed(2)} s  ${words}`));
   by("told").replaceChildren(...lines, ...said);
 }
 

@@ -1,8 +1,4 @@
-"""Two ways to a virtual arm: a port in virtual time with faults of its own, and a pseudo-terminal in real time.
-
-The port's own faults are those of an adapter: it accepts a part of a write or nothing for a while, it is gone for a
-while, and it adds stray bytes. Faults of the arm itself are in settings.py.
-"""
+"""Two ways to a virtual arm: a port in virtual time, and a pseudo-terminal in real time."""
 
 from __future__ import annotations
 
@@ -14,10 +10,9 @@ import tty
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TextIO
 
 import numpy as np
 
@@ -33,36 +28,7 @@ from hardware.simulator.arm.settings import ArmSettings, SerialWire
 Interval = tuple[float, float]  # from, until, s
 
 
-@dataclass(frozen=True, slots=True)
-class PortFaults:
-    """What goes wrong at the port."""
-
-    blocked: Sequence[Interval] = ()  # when the port accepts nothing
-    away: Sequence[Interval] = ()  # when the device is gone
-    partial: float = 0.0  # share of writes that are accepted in part
-    noise: float = 0.0  # stray bytes a second towards the host
-    noise_out: float = 0.0  # share of writes that get a stray byte
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.partial < 1 and self.noise >= 0 and 0 <= self.noise_out <= 1):
-            allowed = "shares below 1, and a rate >= 0"
-            raise InputError("port", "faults", (self.partial, self.noise, self.noise_out), allowed)
-
-
-class LineListener(Protocol):
-    """An observer of the line."""
-
-    def opened(self) -> None:
-        """The host has opened the device."""
-
-    def from_host(self, data: bytes) -> None:
-        """The port has accepted bytes."""
-
-    def to_arm(self, data: bytes) -> None:
-        """Bytes have reached the arm."""
-
-    def to_host(self, sent: bytes, read: bytes) -> None:
-        """The arm's bytes, and the bytes that the host reads, with noise."""
+ByteListener = Callable[[bytes, bool], None]  # of bytes at the port: accepted from the host, else read by it
 
 
 class VirtualPort:
@@ -72,39 +38,24 @@ class VirtualPort:
         self._device = device
         self._wire = SerialWire(device.baud)
         self._in_transit: deque[tuple[float, bytes]] = deque()
-        self._last_read = device.present()
-        if device.listener is not None:
-            device.listener.opened()
+        device.present()
 
     def write(self, data: bytes) -> int:
-        """Accept all bytes, some or none; their count."""
-        device, now = self._device, self._device.present()
-        faults, rng = device.faults, device.rng
-        if any(start <= now < end for start, end in faults.blocked):
-            return 0
-        if faults.partial and rng.random() < faults.partial:
-            data = data[: rng.integers(len(data))]
-        count = len(data)
-        if device.listener is not None:
-            device.listener.from_host(data)
-        if faults.noise_out and rng.random() < faults.noise_out:
-            place = rng.integers(count + 1)
-            data = data[:place] + rng.bytes(1) + data[place:]
+        """Accept all bytes; their count."""
+        now = self._device.present()
+        self._device.listener(data, True)
         if data:
             self._in_transit.append((float(self._wire.send(data, now)[-1]), data))
-        return count
+        return len(data)
 
     def read(self) -> bytes:
-        """The arm's bytes, with noise."""
-        device, now = self._device, self._device.present()
+        """The arm's bytes."""
+        now = self._device.present()
         self.deliver(now)
-        data = device.arm.transmit(now)
-        noise = device.rng.poisson(device.faults.noise * (now - self._last_read)) if device.faults.noise else 0
-        self._last_read = now
-        read = data + device.rng.bytes(noise) if noise else data
-        if device.listener is not None and read:
-            device.listener.to_host(data, read)
-        return read
+        data = self._device.arm.transmit(now)
+        if data:
+            self._device.listener(data, False)
+        return data
 
     def waiting(self) -> int:
         """Count of bytes still on the wire."""
@@ -124,22 +75,13 @@ class VirtualPort:
 
 
 class VirtualDevice:
-    """Opens ports to a VirtualArm; an Opener."""
+    """Opens ports to a VirtualArm; an Opener. away: from, until, s: when the device is gone."""
 
     def __init__(
-        self,
-        arm: VirtualArm,
-        clock: Clock,
-        baud: float = 115_200,
-        faults: PortFaults | None = None,
-        seed: int = 0,
-        listener: LineListener | None = None,
+        self, arm: VirtualArm, clock: Clock, baud: float = 115_200, listener: ByteListener = lambda data, sent: None
     ) -> None:
-        """listener: of all bytes."""
-        self.arm, self.clock, self.baud = arm, clock, baud
-        self.faults = PortFaults() if faults is None else faults
-        self.rng = np.random.default_rng(seed)
-        self.listener = listener
+        self.arm, self.clock, self.baud, self.listener = arm, clock, baud, listener
+        self.away: Sequence[Interval] = ()
         self._port: VirtualPort | None = None  # the last one opened
 
     def __call__(self) -> VirtualPort:
@@ -156,15 +98,13 @@ class VirtualDevice:
     def present(self) -> float:
         """The instant, s; UnpluggedError while the device is away."""
         now = self.clock.now()
-        if any(start <= now < end for start, end in self.faults.away):
+        if any(start <= now < end for start, end in self.away):
             raise UnpluggedError("the device is gone")
         return now
 
     def receive(self, data: bytes, arrival: float) -> None:
         """Bytes reach the arm at `arrival`, s."""
         self.arm.receive(data, max(arrival, self.arm.now))
-        if self.listener is not None:
-            self.listener.to_arm(data)
 
 
 def open_pty() -> tuple[int, int, str]:

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from estimation.errors import InputError
 from estimation.rig import Camera
 from estimation.se3 import Array
+from hardware.process import checks
 from hardware.simulator.scene.fields import (
     Field,
     Size,
@@ -45,11 +45,6 @@ class Appearance:
     ambient: float = 0.3  # irradiance of a white surface that faces the room, the key lamp, the fill lamp
     key: float = 0.62
     fill: float = 0.2
-
-
-def unlit_texture(texture: Image, texel: float = 0.15) -> Appearance:
-    """The look of a picture (H, W, 3) BGR that is imaged as it is: no drape, no lamps, no gloss."""
-    return Appearance(texel=texel, drape=False, texture=texture, lit=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +82,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         for name, most in (("noise", MAX_NOISE), ("vignetting", MAX_VIGNETTING), ("blur", MAX_BLUR)):
-            if not 0 <= getattr(self, name) <= most:
-                raise InputError("sensor", name, getattr(self, name), f"0 to {most:g}")
+            checks.within(0, most)("sensor", name, getattr(self, name))
 
 
 def vignette(camera: Camera, sensor: Sensor) -> Field:

@@ -6,7 +6,6 @@ The loops over rays are compiled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -38,6 +37,8 @@ DEPTH_MARGIN = np.float32(8.0)  # mm of depth by which the cloth between rays re
 DEPTH_JUMP = 15.0  # mm by which the depth between two rays differs from the mean of theirs where the cloth hides itself
 MAX_DRAPE_HEIGHT = 40.0  # mm above the rest plane: nothing of the cloth is higher
 MIN_DRAPE_HEIGHT = -130.0
+CLOTH = "Tuple((f4[:,::1], f4[:,::1], f4[::1], f4[::1], f4[:,::1]))"  # the types of a Cloth
+Cloth = tuple[Field, Field, Field, Field, Field]  # moving, resting, bend, opening and heights of `_cloth`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +58,10 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     sink = np.minimum(m[2, 0] * coarse.x + m[2, 1] * coarse.y + m[2, 2], -0.15)
     near, far = (as_field((height - m[2, 3]) / sink) for height in (MAX_DRAPE_HEIGHT, MIN_DRAPE_HEIGHT))
     first_depth = np.empty_like(coarse.x)
-    _search_cloth(*cloth, *coarse, near, far, DEPTH_STEPS, first_depth)
+    _search_cloth(cloth, *coarse, near, far, DEPTH_STEPS, first_depth)
     depth = upsample(first_depth, (rays.x.shape[0], rays.x.shape[1]))
     at = np.empty((2, *depth.shape), np.float32)
-    _refine_cloth(*cloth, *rays, depth, texels, *at)
+    _refine_cloth(cloth, *rays, depth, texels, *at)
     w, h = view.camera.size
     planes = *at, _key_light_share(state, view, rays, depth)
     u, v, share = (np.ascontiguousarray(upsample(plane, view.whole.size)[:h, :w]) for plane in planes)
@@ -68,7 +69,7 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
         around = np.ones((5, 5), np.uint8)
         near, far = (as_field(f(depth, around)) for f in (cv2.erode, cv2.dilate))
         bounds = as_field(near - DEPTH_MARGIN), as_field(far + DEPTH_MARGIN)
-        _trace_edges(*cloth, edges, *rays, *bounds, EDGE_DEPTH_STEPS, texels, u, v)
+        _trace_edges(cloth, edges, *rays, *bounds, EDGE_DEPTH_STEPS, texels, u, v)
     light, tint = np.empty((h, w, 3), np.float32), as_field(CLOTH_TEAL * as_field(state.lamps[0].colour))
     border = cv2.BORDER_REFLECT_101
     for first in range(0, h, DRAPE_ROWS_AT_ONCE):
@@ -78,21 +79,14 @@ def drape_picture(state: SceneState, view: RenderView) -> DrapePicture:
     return DrapePicture(light, depth)
 
 
-class _Cloth(NamedTuple):
-    """How the cloth lies before a camera, as the loops take it.
+def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> Cloth:
+    """How the cloth lies before a camera: it follows the body near the opening, rests far from it, is mixed between.
 
-    It follows the body near the opening and rests far from it; between, it is a mixture of the two. opening: its half
-    sides less its corners' radius, that radius, how far outside it the cloth rests, 1 / (how far it is held - that).
+    moving, resting: (3, 4) grid_from_camera, mm, and the same of the grid at rest. bend: (4,) by which x and y are
+    stretched back; mm by which the middle is lifted, and its exponent a mm^2. opening: (5,) mm, its half sides less its
+    corners' radius, that radius, how far outside it the cloth rests; and 1 / (how far it is held - that), 1 / mm.
+    heights: (H, W) mm, nodes DRAPE_STEP apart.
     """
-
-    moving: Field  # (3, 4) grid_from_camera, mm
-    resting: Field  # (3, 4) the same of the grid at rest
-    bend: Field  # (4,) by which x and y are stretched back; mm by which the middle is lifted, and its exponent a mm^2
-    opening: Field  # (5,) mm and 1 / mm
-    heights: Field  # (H, W) mm, nodes DRAPE_STEP apart
-
-
-def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> _Cloth:
     scene, moving = state.scene, se3.inverse(state.base_from_grid) @ view.camera.base_from_camera
     lift = scene.deformation.bulge * state.instant.strain, -1 / (2 * scene.deformation.radius**2)
     half, resting, attached = (0.0, 0.0), -1e6, -1e6 - 1  # without an opening all of it rests
@@ -100,8 +94,7 @@ def _cloth(state: SceneState, view: RenderView, rest_from_camera: Array) -> _Clo
         half, resting, attached = scene.sheet.half, AT_REST_BEYOND, ATTACHED_WITHIN
     opening = half[0] - OPENING_CORNER, half[1] - OPENING_CORNER, OPENING_CORNER, resting, 1 / (attached - resting)
     bend = 1 / state.factors[0], 1 / state.factors[1], *lift
-    frames = as_field(moving[:3]), as_field(rest_from_camera[:3])
-    return _Cloth(*frames, as_field(bend), as_field(opening), scene.sheet.heights)
+    return as_field(moving[:3]), as_field(rest_from_camera[:3]), as_field(bend), as_field(opening), scene.sheet.heights
 
 
 def _edges(depth: Field) -> NDArray[np.uint8]:
@@ -121,22 +114,13 @@ def _key_light_share(state: SceneState, view: RenderView, rays: Rays, depth: Fie
     return passing_light(points, nozzle_from_base @ state.scene.base_from_rest, state.lamps[0])
 
 
-CLOTH = "f4[:,::1], f4[:,::1], f4[::1], f4[::1], f4[:,::1]"  # the types of a _Cloth
 Place = tuple[np.float32, np.float32, np.float32]
 
 
 @compiled(f"UniTuple(f4, 3)({CLOTH}, f4, f4, f4)", inlined=True)
-def _above_cloth(
-    moving: Field,
-    resting: Field,
-    bend: Field,
-    opening: Field,
-    heights: Field,
-    x: np.float32,
-    y: np.float32,
-    depth: np.float32,
-) -> Place:
+def _above_cloth(cloth: Cloth, x: np.float32, y: np.float32, depth: np.float32) -> Place:
     """How far above the cloth the point at `depth` of a ray (x, y, 1) is, mm, and where on it: x, y mm."""
+    moving, resting, bend, opening, heights = cloth
     a, b = x * depth, y * depth
     mx = moving[0, 0] * a + moving[0, 1] * b + moving[0, 2] * depth + moving[0, 3]
     my = moving[1, 0] * a + moving[1, 1] * b + moving[1, 2] * depth + moving[1, 3]
@@ -161,22 +145,13 @@ def _above_cloth(
 
 @compiled(f"f4({CLOTH}, f4, f4, f4, f4, i8)", inlined=True)
 def _first_on_cloth(
-    moving: Field,
-    resting: Field,
-    bend: Field,
-    opening: Field,
-    heights: Field,
-    x: np.float32,
-    y: np.float32,
-    near: np.float32,
-    far: np.float32,
-    steps: int,
+    cloth: Cloth, x: np.float32, y: np.float32, near: np.float32, far: np.float32, steps: int
 ) -> np.float32:
     """Depth mm at which a ray first meets the cloth, by equal steps from near to far; far where it never does."""
     step, last_gap = (far - near) / np.float32(steps), ONE
     for k in range(steps + 1):
         depth = near + step * np.float32(k)
-        gap, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
+        gap, _, _ = _above_cloth(cloth, x, y, depth)
         if gap <= NOTHING:
             return depth + step * gap / max(last_gap - gap, np.float32(1e-6))
         last_gap = gap
@@ -184,62 +159,29 @@ def _first_on_cloth(
 
 
 @compiled(f"UniTuple(f4, 3)({CLOTH}, f4, f4, f4)", inlined=True)
-def _on_cloth(
-    moving: Field,
-    resting: Field,
-    bend: Field,
-    opening: Field,
-    heights: Field,
-    x: np.float32,
-    y: np.float32,
-    depth: np.float32,
-) -> Place:
+def _on_cloth(cloth: Cloth, x: np.float32, y: np.float32, depth: np.float32) -> Place:
     """The depth of a ray after a round of the secant method, and the cloth's x, y mm there."""
-    upper_gap, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth + HALF)
-    gap, _, _ = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
+    upper_gap, _, _ = _above_cloth(cloth, x, y, depth + HALF)
+    gap, _, _ = _above_cloth(cloth, x, y, depth)
     slope = np.float32(2) * (upper_gap - gap)
     if abs(slope) < np.float32(0.1):
         slope = -HALF
     depth -= min(max(gap / slope, np.float32(-15)), np.float32(15))
-    _, cloth_x, cloth_y = _above_cloth(moving, resting, bend, opening, heights, x, y, depth)
+    _, cloth_x, cloth_y = _above_cloth(cloth, x, y, depth)
     return depth, cloth_x, cloth_y
 
 
 @compiled(f"void({CLOTH}, f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1])")
-def _search_cloth(
-    moving: Field,
-    resting: Field,
-    bend: Field,
-    opening: Field,
-    heights: Field,
-    x: Field,
-    y: Field,
-    near: Field,
-    far: Field,
-    steps: int,
-    depth: Field,
-) -> None:
+def _search_cloth(cloth: Cloth, x: Field, y: Field, near: Field, far: Field, steps: int, depth: Field) -> None:
     """`_first_on_cloth` of rays (H, W)."""
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
             rx, ry, low, high = x[row, column], y[row, column], near[row, column], far[row, column]
-            depth[row, column] = _first_on_cloth(moving, resting, bend, opening, heights, rx, ry, low, high, steps)
+            depth[row, column] = _first_on_cloth(cloth, rx, ry, low, high, steps)
 
 
 @compiled(f"void({CLOTH}, f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[:,::1])")
-def _refine_cloth(
-    moving: Field,
-    resting: Field,
-    bend: Field,
-    opening: Field,
-    heights: Field,
-    x: Field,
-    y: Field,
-    depth: Field,
-    texels: Field,
-    u: Field,
-    v: Field,
-) -> None:
+def _refine_cloth(cloth: Cloth, x: Field, y: Field, depth: Field, texels: Field, u: Field, v: Field) -> None:
     """Depth (H, W) mm of rays, refined in place, and the columns u and rows v of the cloth's picture there.
 
     texels: (3,) texels a mm, and the column and row in the middle.
@@ -247,18 +189,14 @@ def _refine_cloth(
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
             rx, ry, at = x[row, column], y[row, column], depth[row, column]
-            refined, cloth_x, cloth_y = _on_cloth(moving, resting, bend, opening, heights, rx, ry, at)
+            refined, cloth_x, cloth_y = _on_cloth(cloth, rx, ry, at)
             depth[row, column] = refined
             u[row, column], v[row, column] = cloth_x * texels[0] + texels[1], cloth_y * texels[0] + texels[2]
 
 
 @compiled(f"void({CLOTH}, u1[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[::1], f4[:,::1], f4[:,::1])")
 def _trace_edges(
-    moving: Field,
-    resting: Field,
-    bend: Field,
-    opening: Field,
-    heights: Field,
+    cloth: Cloth,
     edges: Bytes,
     x: Field,
     y: Field,
@@ -282,8 +220,8 @@ def _trace_edges(
                 along = (np.float32(column) + HALF) / np.float32(CELL_PX) - HALF
                 rx, ry = height_at(x, along, at), height_at(y, along, at)
                 low, high = height_at(near, along, at), height_at(far, along, at)
-                depth = _first_on_cloth(moving, resting, bend, opening, heights, rx, ry, low, high, steps)
-                _, cloth_x, cloth_y = _on_cloth(moving, resting, bend, opening, heights, rx, ry, depth)
+                depth = _first_on_cloth(cloth, rx, ry, low, high, steps)
+                _, cloth_x, cloth_y = _on_cloth(cloth, rx, ry, depth)
                 u[row, column], v[row, column] = cloth_x * texels[0] + texels[1], cloth_y * texels[0] + texels[2]
 
 

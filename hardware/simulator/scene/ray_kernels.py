@@ -284,23 +284,15 @@ def shade(
     room_b, room_g, room_r, mirrored = room[0], room[1], room[2], room[3]
     creep_b, creep_g, creep_r = room[4], room[5], room[6]
     for k in range(len(colours) // 4):
-        across, along, gloss, sky = (
-            reliefs[4 * k] * part,
-            reliefs[4 * k + 1] * part,
-            reliefs[4 * k + 2] * part,
-            reliefs[4 * k + 3] * part,
-        )
+        across, along = reliefs[4 * k] * part, reliefs[4 * k + 1] * part
+        gloss, sky = reliefs[4 * k + 2] * part, reliefs[4 * k + 3] * part
         facing = ONE / np.sqrt(across * across + along * along + ONE)
         open_room = sky * (np.float32(0.45) + np.float32(0.55) * facing)
         wet, dry = gloss * gloss, np.float32(0.3) + gloss
         arrive0, arrive1 = sky * passed[4 * k], sky * passed[4 * k + 1]
         cosine0, cosine1 = (z0 - x0 * across - y0 * along) * facing, (z1 - x1 * across - y1 * along) * facing
-        u0, v0, u1, v1 = (
-            across - mirrors[4 * k],
-            along - mirrors[4 * k + 1],
-            across - mirrors[4 * k + 2],
-            along - mirrors[4 * k + 3],
-        )
+        u0, v0 = across - mirrors[4 * k], along - mirrors[4 * k + 1]
+        u1, v1 = across - mirrors[4 * k + 2], along - mirrors[4 * k + 3]
         square0, square1 = u0 * u0 + v0 * v0, u1 * u1 + v1 * v1
         film0 = _fading(square0 * wet_e0) * wet_s0 * wet + _fading(square0 * dry_e0) * dry_s0 * dry
         film1 = _fading(square1 * wet_e1) * wet_s1 * wet + _fading(square1 * dry_e1) * dry_s1 * dry

@@ -173,7 +173,6 @@ class SceneState:
     scene: Scene
     instant: WorldState
     base_from_grid: Array  # (4, 4) mm
-    rest_from_grid: Array  # (4, 4) mm, against the grid at rest
     relief: HeightField  # deformed heights on the nodes of material points
     factors: tuple[float, float]  # stretch of material lengths x, y
     lamps: tuple[Lamp, Lamp]
@@ -200,7 +199,7 @@ def scene_state(scene: Scene, instant: WorldState) -> SceneState:
         nozzle_from_rest = nozzle_from_base @ scene.base_from_rest
         shares = [passing_light(points, nozzle_from_rest, lamp) for lamp in lamp_pair]
         shadow = np.dstack([*shares, *shares])
-    return SceneState(scene, instant, base_from_grid, rest_from_grid, relief, factors, lamp_pair, towards, shadow)
+    return SceneState(scene, instant, base_from_grid, relief, factors, lamp_pair, towards, shadow)
 
 
 def transform_fields(transform: Array, x: Field, y: Field, z: Field) -> tuple[Field, Field, Field]:

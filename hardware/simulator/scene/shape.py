@@ -14,6 +14,7 @@ from estimation import se3
 from estimation.errors import InputError
 from estimation.scans.scan import Scan, cast_rays, face_areas, face_normals, scan_from_triangles
 from estimation.se3 import Array
+from hardware.process import checks
 from hardware.simulator.scene.fields import smooth_noise
 
 NODE_STEP = 0.25  # mm between nodes: a wound's rim rises over 2 mm
@@ -187,11 +188,8 @@ class Deformation:
             if not STRETCH_RANGE[0] <= value <= STRETCH_RANGE[1]:
                 allowed = f"{STRETCH_RANGE[0]} to {STRETCH_RANGE[1]}, a share of length"
                 raise InputError("deformation", "stretch", value, allowed)
-        if not abs(self.bulge) <= MAX_BULGE:
-            raise InputError("deformation", "bulge", self.bulge, f"-{MAX_BULGE:g} to {MAX_BULGE:g} mm")
-        if not BULGE_RADIUS_RANGE[0] <= self.radius <= BULGE_RADIUS_RANGE[1]:
-            allowed = f"{BULGE_RADIUS_RANGE[0]:g} to {BULGE_RADIUS_RANGE[1]:g} mm"
-            raise InputError("deformation", "radius", self.radius, allowed)
+        checks.within(-MAX_BULGE, MAX_BULGE, "mm")("deformation", "bulge", self.bulge)
+        checks.within(*BULGE_RADIUS_RANGE, "mm")("deformation", "radius", self.radius)
 
     def factors(self, amount: float) -> tuple[float, float]:
         """Factors of lengths along x and y."""
