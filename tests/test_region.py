@@ -7,13 +7,14 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from estimation.errors import InputError
-from estimation.pose import SurfacePose
+from estimation.pose import SurfacePose, identity_pose
 from estimation.rig import Rig
 from hardware.files.region_table import (
     ANY_REGION,
@@ -33,7 +34,7 @@ from hardware.operator.shared_state import Polygons
 from hardware.process.system import SharedLatest
 from perception.frames import FrameSet, Roi, region_polygons, region_since
 from perception.tracking.step import TrackingStep
-from perception.tracking.wound_step import PATCH_SEARCH_TEXT, RegionSearch, RegionTrackingStep
+from perception.tracking.wound_step import EDGE_SHARE, PATCH_SEARCH_TEXT, RegionSearch, RegionTrackingStep
 from perception.wound.segmentation import ColourSegmenter
 from tests.printed_sheet import FPS, FRAME_RGB, SIZE, corners_at, displacement_errors, pictures, region, rig
 from tests.uptime import DAY
@@ -216,9 +217,40 @@ def test_a_sheet_on_a_table_is_followed_inside_its_coloured_frame() -> None:
     assert poses[0].reason == PATCH_SEARCH_TEXT and len(off) > 12 and off.max() < MAX_ERROR
     (rois,) = asked
     for roi, camera in zip(rois, rig().cameras, strict=True):
-        outline = corners_at(0.0, camera)
-        assert all(np.linalg.norm(roi.polygon - corner, axis=1).min() < 3.0 for corner in outline)  # px
+        outline = corners_at(roi.stamp, camera)
+        drawn_in = (1 - EDGE_SHARE) * outline + EDGE_SHARE * outline.mean(0)
+        assert all(np.linalg.norm(roi.polygon - corner, axis=1).min() < 3.0 for corner in drawn_in)  # px
         assert len(roi.polygon) <= 8
+
+
+class Shown:
+    """A tracking step that notes which frame sets it is given."""
+
+    def __init__(self, stamps: list[float]) -> None:
+        self.stamps, self.last = stamps, None
+
+    def __call__(self, frames: FrameSet) -> SurfacePose:
+        self.stamps.append(frames.stamp)
+        return identity_pose(frames.stamp, "shown")
+
+
+def test_tracking_begins_with_the_pictures_in_which_the_frame_was_found() -> None:
+    """What is framed may have moved on since, and a frame set later its region would hold some of the table."""
+    shown, found = list[float](), list[Roi]()
+
+    def made(rois: Sequence[Roi]) -> TrackingStep:
+        found.extend(rois)
+        return Shown(shown)  # type: ignore[return-value]
+
+    step = RegionTrackingStep(rig(), made, RegionSearch(rig(), ColourSegmenter(FRAME_RGB), patch=True))
+    for frames in sets()[:9]:
+        step(frames)
+    stamps = [frames.stamp for frames in sets()[:9]]
+    assert shown[0] == found[0].stamp == stamps[0] and shown[1] > stamps[1] and shown[-1] == stamps[-1]
+    for roi, camera in zip(found, rig().cameras, strict=True):
+        edge = np.float32(corners_at(shown[0], camera))[:, None]
+        assert all(cv2.pointPolygonTest(edge, [float(x) for x in corner], True) > 1.0 for corner in roi.polygon)  # px
+        assert cv2.contourArea(np.float32(roi.polygon)) > 0.7 * cv2.contourArea(edge)
 
 
 @pytest.mark.slow

@@ -437,7 +437,8 @@ def test_the_surface_is_tracked_where_the_wound_was_seen() -> None:
         size = np.array(RIG.cameras[roi.camera].size)
         inside = np.clip(told.polygon, 0, size - 1)
         assert (roi.polygon.min(0) <= inside.min(0)).all() and (roi.polygon.max(0) >= inside.max(0)).all()
-    assert all(same(a, b) for a, b in zip(poses[3:], run(sets[3:], rois), strict=True))
+    begun = [sets[0], *sets[3:]]  # with the pictures in which the wound was seen
+    assert all(same(a, b) for a, b in zip(poses[3:], run(begun, rois)[1:], strict=True))
 
 
 @pytest.mark.slow

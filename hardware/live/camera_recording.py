@@ -243,7 +243,7 @@ class CameraRecording:
         if self._find_region is not None and not isinstance(region := self._find_region(frames), str):
             self._find_region = None
             for roi in region:
-                self._sender.put(region_since(roi, frames.stamp))
+                self._sender.put(region_since(roi, roi.stamp))
 
     # -- what is said of it
 

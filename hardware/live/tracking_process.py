@@ -380,12 +380,12 @@ class _TrackingLoop:
         self._thumbnailer.offer(frames.stamp, shots, base_from_surface)
 
     def _record_region(self, stamp: float) -> None:
-        """Record a region that was found or drawn, so that tracking of the recording also begins with this set."""
+        """Record a region that was found or drawn, so that tracking of the recording begins with the same frame set."""
         if self._region_recorded or not self._step.roi:
             return
-        self._region_recorded = True
+        self._region_recorded, searched = True, isinstance(self._step, RegionTrackingStep)
         for roi in self._step.roi:
-            self._sender.put(region_since(roi, stamp))
+            self._sender.put(region_since(roi, roi.stamp if searched else stamp))
 
     def _record(self, timed_set: TimedFrameSet, frames: FrameSet, pose: SurfacePose) -> None:
         unencoded = tuple(frame for frame in frames.frames if frame.camera not in timed_set.encoded)

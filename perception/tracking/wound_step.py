@@ -119,6 +119,7 @@ def segment_all(segmenter: Segmenter, images: Mapping[int, Image]) -> dict[int, 
 MAX_EMPTY_LOOKS = 2  # without a wound in two cameras, after which whole pictures are the region
 MAX_PARTIAL_LOOKS = 5  # at a frame or patch not seen by all cameras: some may lack in the first frame sets
 SKIN_MARGIN_SHARE = 0.6  # of the wound's box, on every side: the skin there moves with it and has more texture
+EDGE_SHARE = 0.1  # by which a patch's outline is drawn in: what lies under it begins there, and does not move with it
 WHOLE_PICTURES = "no region and no wound: whole pictures are tracked as one surface; better draw a region"
 WOUND_SEARCH_TEXT, PATCH_SEARCH_TEXT = "the wound is being looked for", "the coloured frame is being looked for"
 
@@ -131,13 +132,14 @@ class WoundSight:
     masks: Mapping[int, WoundMask]  # (H, W) by camera; cameras without a wound are left out
 
 
-FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, from this frame set on, or why there is none
+FindRegion = Callable[[FrameSet], Sequence[Roi] | str]  # the region, known since its stamp, or why there is none
 
 
 class RegionSearch:
     """Searches for the region by a segmenter, once a frame set.
 
-    sight: source of the region; None before, and for a frame or patch.
+    sight: source of the region; None before, and for a frame or patch. source: its pictures; None before, and for whole
+    pictures.
     """
 
     def __init__(self, rig: Rig, segmenter: Segmenter, executor: Executor | None = None, patch: bool = False) -> None:
@@ -150,9 +152,10 @@ class RegionSearch:
         self._segmentation = AsyncSegmentation(rig, segmenter, executor)
         self._looks = 0
         self.sight: WoundSight | None = None
+        self.source: FrameSet | None = None
 
     def __call__(self, frames: FrameSet) -> Sequence[Roi] | str:
-        """The region in each camera, once two cameras or more see it; else why there is none."""
+        """The region in each camera, since the pictures that show it, once two cameras or more do; else why there is none."""
         source = self._segmentation.job_frames  # pictures of the next result
         result = self._segmentation(frames)
         if result is None:
@@ -166,8 +169,9 @@ class RegionSearch:
         if source is not None and not self._patch:
             self.sight = WoundSight(source, {c: wound.mask for c, wound in wounds.items() if wound.box is not None})
         if enough:
+            self.source = source
             return self._rois(stamp, wounds)
-        return whole_pictures([camera.size for camera in self._rig.cameras], stamp)
+        return whole_pictures([camera.size for camera in self._rig.cameras], frames.stamp)
 
     @property
     def _search_text(self) -> str:
@@ -176,7 +180,8 @@ class RegionSearch:
     def _rois(self, stamp: float, wounds: dict[int, WoundEstimate]) -> Sequence[Roi]:
         """Regions around each camera's wound, or whole pictures without one; or the patch's outlines."""
         if self._patch:
-            return [Roi(c, stamp, hull_of(wound.mask)) for c, wound in wounds.items() if wound.box is not None]
+            hulls = {c: hull_of(wound.mask) for c, wound in wounds.items() if wound.box is not None}
+            return [Roi(c, stamp, (1 - EDGE_SHARE) * hull + EDGE_SHARE * hull.mean(0)) for c, hull in hulls.items()]
         rois = []
         for camera, wound in wounds.items():
             size = self._rig.cameras[camera].size
@@ -207,6 +212,9 @@ class RegionTrackingStep:
             self._step = self._make_step(regions)
             whole = of_whole_pictures(regions, [camera.size for camera in self._rig.cameras])
             self._caveat = WHOLE_PICTURES if whole else ""
+            source = self._find.source if isinstance(self._find, RegionSearch) else None
+            if source is not None:  # there the region is known; the surface may have left it since
+                self._step(source)
         pose = self._step(frames)
         self.last = self._step.last
         return pose if pose.reason else replace(pose, reason=self._caveat)
