@@ -155,7 +155,7 @@ class RegionSearch:
         self.source: FrameSet | None = None
 
     def __call__(self, frames: FrameSet) -> Sequence[Roi] | str:
-        """The region in each camera, since the pictures that show it, once two cameras or more do; else why there is none."""
+        """Each camera's region, since the pictures that show it, once two cameras or more do; else the reason."""
         source = self._segmentation.job_frames  # pictures of the next result
         result = self._segmentation(frames)
         if result is None:
