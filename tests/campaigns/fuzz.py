@@ -118,7 +118,7 @@ SCAN_TRIANGLES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
 SKIN_NODES = 6  # a side of the scan that is planned on, so that it has the triangles that repair asks for
 SMALL_SIZE, VIDEO_RATE, FRAME_COUNT = (48, 32), 30, 3  # px, Hz
 CORNERS_KEY = "0123456789abcdef" * 4  # of the recording that the corners belong to
-FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}
+FORMAT_SUFFIX = {"kalibr": ".yaml", "anipose": ".toml"}  # the others are folders with a file for each camera
 XYZ_TEXT = "".join(f"{k % 9} {k // 9} {k % 7 / 10}\n" for k in range(81))
 
 
@@ -282,8 +282,9 @@ def _plain(file: str, content: str | bytes, read: Callable[[Path], object]) -> R
 def _format_reader(name: str) -> Reader:
     """A reader of another program's rig format."""
     form = FORMATS[name]
-    file = "cam_0.yaml" if form.folder else f"x{FORMAT_SUFFIX[name]}"
-    return Reader(file, lambda folder: form.write(folder / ("." if form.folder else file), arc_rig()), form.read)
+    suffix = FORMAT_SUFFIX.get(name)
+    file = "cam_0.yaml" if suffix is None else f"x{suffix}"
+    return Reader(file, lambda folder: form.write(folder if suffix is None else folder / file, arc_rig()), form.read)
 
 
 def _decoded(path: Path) -> str:
