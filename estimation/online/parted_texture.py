@@ -135,8 +135,8 @@ class PartedTexture:
         fit: FrameFit,
         elsewhere: Observations | None,
         points: Array,
-        periodic: bool = False,
-        moved: float = 0.0,
+        periodic: bool,
+        moved: float,
     ) -> None:
         """Take the accepted fit that `search` was called with, and observations elsewhere. points: (N, 3) mm.
 
